@@ -26,13 +26,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.solve import reaction_columns, reaction_with_errors, solve_moments
-from tests.solver.moments.test_solve import (
-    around,
-    near_points,
-    ngsolve_reaction,
-    random_magnet,
-    three,
-)
+from tests.solver.moments.test_solve import around, errors_in_bars, ngsolve_reaction, three
 from tests.support.memory import own_peak
 
 SIDE, REMANENCE, PERMEABILITY = 0.012, 1.4, 1.05
@@ -145,18 +139,8 @@ def close_cubes(note: Note) -> None:
 
 def coverage(note: Note) -> None:
     """Random magnets, readings far from and at a tenth of a block from them."""
-    generator, ratios = np.random.default_rng(2), []
-    for chi in (0.05, 0.05, 0.1, 0.1, 0.5, 1.0):
-        for _ in range(3):
-            blocks = random_magnet(generator, chi)
-            points = np.vstack([0.03 * generator.normal(size=(40, 3)),
-                                near_points(generator, blocks, 0.005, 20),
-                                near_points(generator, blocks, 0.001, 20)])
-            points = points[~np.any([block.contains(points) for block in blocks], axis=0)]
-            truth = solve_moments(blocks, cells_per_side=4, divisions=3).reaction(points)
-            found, error = reaction_with_errors(blocks, points)
-            ratios.append(np.abs(found - truth) / error)
-    ratio = np.vstack(ratios)
+    ratio = errors_in_bars(np.random.default_rng(2), np.repeat(
+        [0.05, 0.05, 0.1, 0.1, 0.5, 1.0], 3), 40)
     for bars in (1, 2):
         note(f"moments.coverage_{bars}_sd", float(np.mean(ratio <= bars)), "ratio",
              f"{ratio.size} components, 18 magnets, half the points within half a block of one; "

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.note import Note
 from halbach_fe.core.arrays import Floats
 from halbach_fe.design.forces import forces
-from halbach_fe.design.shim_tray import FilledTray, shim_tray
+from halbach_fe.design.shim_tray import shim_tray
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -31,6 +31,8 @@ from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import draw_magnet
 from halbach_fe.synthetic.simulate import true_field
+from tests.conftest import changed
+from tests.design.test_shim_tray import DOCUMENT, NOISE_T, STRENGTH_SD, cuboid, shims
 
 STUDIES = Path(__file__).parents[1] / "studies"
 
@@ -38,29 +40,10 @@ MAGNETS = 20
 CELLS = 1000
 """Of a cube in magpylib's integral of the force."""
 
-NOISE_T, STRENGTH_SD = 2e-6, 0.02
 MAGNITUDE_SD, DIRECTION_SD_DEG = 0.01, 1.0
-SIDE_M, SHIM_T = 0.05, 1.2
 DSV = Region.sphere(0.03)
 
-TRAY = {
-    "name": "tray", "dimension": 3,
-    "array": {
-        "blocks_per_ring": 8, "rings": 6, "inner_radius_m": 0.1, "outer_radius_m": 0.1 + SIDE_M,
-        "ring_length_m": SIDE_M, "ring_gap_m": 0.02, "remanence_T": 1.2,
-        "recoil_permeability": 1.0,
-        "block": {"shape": "cuboid", "width_m": SIDE_M, "orientation": "magnetization"}},
-    "mesh": {"block_size_m": 0.03},
-    "observation": {"quantity": "flux_density", "positions": {
-        "kind": "circles", "radius_m": [0.03, 0.06], "angles": 16, "z_min_m": -0.06,
-        "z_max_m": 0.06, "count": 7}},
-    "noise": {"regions": [{"name": "bore", "sigma_T": NOISE_T}]},
-    "prior": {"magnitude_sd": MAGNITUDE_SD, "direction_sd_deg": DIRECTION_SD_DEG},
-    "shim_tray": {
-        "rings": [{"radius_m": 0.08, "count": 16, "z_m": [-0.09, -0.045, 0.0, 0.045, 0.09]}],
-        "strength_sd": STRENGTH_SD, "common_sd": STRENGTH_SD,
-        "magnets": [{"name": f"{size} mm", "size_m": [1e-3 * size] * 3, "remanence_T": SHIM_T,
-                     "count": 40} for size in (10, 6, 4)]}}
+TRAY = changed(DOCUMENT, shim_tray__common_sd=STRENGTH_SD)
 """48 cubes whose field in a sphere of 60 mm is shimmed by cubes of three sizes."""
 
 
@@ -89,13 +72,6 @@ def homogeneity(note: Note, session: Session) -> None:
          f"error of a component {model.solver_error_ppm:.1f} ppm")
 
 
-def cuboid(size: tuple[float, ...], polarization: Floats, place: tuple[float, ...],
-           faces: Rotation) -> magpylib.magnet.Cuboid:
-    """Return magpylib's cuboid with a polarization (3,) in T along the axes of the magnet."""
-    return magpylib.magnet.Cuboid(dimension=size, polarization=faces.inv().apply(polarization),
-                                  position=place, orientation=faces)
-
-
 def nominal_cuboid(block: MagnetBlock, polarization: Floats) -> magpylib.magnet.Cuboid:
     """Return magpylib's cuboid in the place of a block that is a cube."""
     side = block.z_max - block.z_min
@@ -115,20 +91,7 @@ def built(blocks: tuple[MagnetBlock, ...], generator: np.random.Generator) -> ma
     return magpylib.Collection(*sources)
 
 
-def tray(found: FilledTray, generator: np.random.Generator) -> magpylib.Collection:
-    """Return magpylib's shims of a filled tray, of uncertain strength."""
-    common, sources = STRENGTH_SD * generator.standard_normal(), []
-    for one in found.filled:
-        strength = SHIM_T * (1 + common + STRENGTH_SD * generator.standard_normal())
-        angle = np.radians(one.direction_deg)
-        x, y, _ = one.position_m
-        sources.append(cuboid(
-            one.magnet.size_m, strength * np.array([np.cos(angle), np.sin(angle), 0.0]),
-            one.position_m, Rotation.from_euler("z", np.arctan2(y, x))))
-    return magpylib.Collection(*sources)
-
-
-def shims(note: Note, session: Session) -> None:
+def trays(note: Note, session: Session) -> None:
     """Note by how much trays reduce the deviation of simulated magnets, and the chi² foretold."""
     study = parse_study(TRAY)
     magnet, points = build_magnet(study), points_from(study.observation.positions)
@@ -142,7 +105,7 @@ def shims(note: Note, session: Session) -> None:
         model = found.model
         region = model.points[:len(model.weights)]
         bare = truth.getB(region)
-        shimmed = bare + (tray(found, generator).getB(region) if found.filled else 0)
+        shimmed = bare + (shims(found.filled, generator).getB(region) if found.filled else 0)
         mean, rms, _ = model.deviations(np.stack([bare, shimmed], axis=2))
         reduction.append(rms[0] / rms[1])
         low, _, high = found.after.rms_range_ppm
@@ -182,5 +145,5 @@ def all_forces(note: Note, session: Session) -> None:
 def run(note: Note) -> None:
     """Note all figures."""
     with TemporaryDirectory() as folder:
-        for part in (homogeneity, shims, all_forces):
+        for part in (homogeneity, trays, all_forces):
             part(note, Session.open(Path(folder, part.__name__)))

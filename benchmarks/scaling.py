@@ -26,8 +26,9 @@ import tomlkit
 from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.cli import main as halbach_fe
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -137,44 +138,36 @@ def twelve_rings(size: float) -> Study:
             "z_max_m": 0.5}))
 
 
-def modes(size: float, jobs: int) -> dict[str, Any]:
-    """All columns by azimuthal modes."""
-    study = twelve_rings(size)
-    points = points_from(study.observation.positions)
+def measured_solve(
+    study: Study, jobs: int, solve: Callable[[Magnet, Floats, Session], object]
+) -> dict[str, Any]:
+    """Solve for the field at the study's positions; return its cost and number of unknowns."""
+    points, magnet = points_from(study.observation.positions), build_magnet(study)
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_modes(build_magnet(study), points, range(0, 96, 16),
-                    Session(scales.getdp, Path(name), jobs=jobs))
+        solve(magnet, points, Session(scales.getdp, Path(name), jobs=jobs))
         seconds, peak = time.monotonic() - started, scales.peak
     problem = max(
-        estimate_infer(build_magnet(study), observe(study, points, np.ones_like(points, bool)),
-                       1).problems,
-                  key=lambda one: one.unknowns)
-    return {"unknowns": problem.unknowns, "jobs": jobs, "seconds": seconds,
-            "getdp_GiB": peak}
+        estimate_infer(magnet, observe(study, points, np.ones_like(points, bool)), 1).problems,
+        key=lambda one: one.unknowns)
+    return {"unknowns": problem.unknowns, "jobs": jobs, "seconds": seconds, "getdp_GiB": peak}
+
+
+def modes(size: float, jobs: int) -> dict[str, Any]:
+    """All columns by azimuthal modes."""
+    return measured_solve(twelve_rings(size), jobs, lambda magnet, points, session: solve_modes(
+        magnet, points, range(0, 96, 16), session))
 
 
 def solid(size: float) -> dict[str, Any]:
     """The nominal array of two rings on a 3D mesh."""
-    study = parse_study(changed(
+    return measured_solve(parse_study(changed(
         DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,
         mesh={"block_size_m": size, "layers_per_ring": max(1, round(0.06 / size)), "growth": 1.6},
         solver__route="scalar_potential", observation__positions={
             "kind": "circles", "radius_m": 0.05, "angles": 8, "count": 5, "z_min_m": -0.1,
-            "z_max_m": 0.1}))
-    points = points_from(study.observation.positions)
-    with tempfile.TemporaryDirectory() as name:
-        scales = Weighed.of(find_getdp(), Path(name))
-        started = time.monotonic()
-        solve_nominal(build_magnet(study), points, Session(scales.getdp, Path(name), jobs=1))
-        seconds, peak = time.monotonic() - started, scales.peak
-    problem = max(
-        estimate_infer(build_magnet(study), observe(study, points, np.ones_like(points, bool)),
-                       1).problems,
-                  key=lambda one: one.unknowns)
-    return {"unknowns": problem.unknowns, "jobs": 1, "seconds": seconds,
-            "getdp_GiB": peak}
+            "z_max_m": 0.1})), 1, solve_nominal)
 
 
 def slope(points: Sequence[dict[str, Any]], size: str, what: str, start: float) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -166,9 +167,9 @@ def diagnose_map(folder: Path) -> dict[str, float]:
 
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()) as shown:
+        os.environ["HALBACH_FE_CACHE"] = str(Path(name) / "cache")  # empty, as on the first day
         code = main(["diagnose", str(folder / "study.toml"), "--measurements",
-                     str(folder / "map.csv"), "-o", str(Path(name) / "out"), "--json",
-                     "--no-cache"])
+                     str(folder / "map.csv"), "-o", str(Path(name) / "out"), "--json"])
     if code:
         raise SystemExit(code)
     found = json.loads(shown.getvalue())

@@ -126,12 +126,7 @@ def new(arguments: argparse.Namespace) -> int:
 
 
 def _check(given: Mapping[str, object], radius_m: float | None) -> None:
-    """Refuse options that the study would not show beside others.
-
-    Raises
-    ------
-    CommandLineError
-    """
+    """Refuse options that the study would not show beside others."""
     long = bool(given.keys() & {"ring_length_m", "cube_m", "free_blocks"})
     rings, edge = given.get("rings"), given.get("cube_m")
     follow = "Rings that follow each other along z have a length."

@@ -64,10 +64,7 @@ def draw(
 ) -> dict[int, list[int]]:
     """Draw the cross-section in a disk, of the first ring in 3D, and set the element sizes.
 
-    Parameters
-    ----------
-    radius : float, in m
-        Radius of the disk, the outer boundary.
+    ``radius`` in m: radius of the disk, the outer boundary.
 
     Returns
     -------

@@ -25,31 +25,21 @@ from halbach_fe.study.model import MeshSettings
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the elements of iron.
-
-    Attributes
-    ----------
-    iron : float
-        Largest size in m.
-    thickness : float
-        Largest size relative to the ratio of a body's volume and surface, half the thickness of a
-        plate.
-    curvature : float
-        Largest size relative to the radius of a round body.
-    edge : float
-        Size along the edges, where the field is singular, relative to that in the body.
-    gap : float
-        Size along edges at a narrow gap between two bodies, relative to the gap's width.
-    growth : float
-        Change of the size per unit of distance in the air.
-    """
+    """Sizes of the elements of iron."""
 
     iron: float
+    """Largest size in m."""
     thickness: float
+    """Largest size relative to the ratio of a body's volume and surface, half the thickness of a
+    plate."""
     curvature: float
+    """Largest size relative to the radius of a round body."""
     edge: float
+    """Size along the edges, where the field is singular, relative to that in the body."""
     gap: float
+    """Size along edges at a narrow gap between two bodies, relative to the gap's width."""
     growth: float
+    """Change of the size per unit of distance in the air."""
 
     @classmethod
     def of(cls, mesh: MeshSettings, coarseness: float = 1.0) -> Sizes:
@@ -133,10 +123,7 @@ def _generate(name: str) -> None:
     A tetrahedron with two faces on a sphere is flat where they meet. Gmsh's optimizer mends such,
     but leaves them inside out in one mesh in some thirty; then elements are a little smaller.
 
-    Raises
-    ------
-    MeshError
-        If curved sides turn an element inside out in every mesh.
+    MeshError if curved sides turn an element inside out in every mesh.
     """
     mesh, raising = gmsh.model.mesh, gmsh.option.getNumber("General.AbortOnError")
     for factor in (1.0, 0.97, 0.94):

@@ -157,7 +157,6 @@ def mesh_half_plane(
         Grid lines, ascending; ``r`` starts at 0.
     in_iron : ndarray of bool, shape (len(r) - 1, len(z) - 1)
         The rectangles of the grid that are iron.
-    mesh_path : Path
 
     Raises
     ------

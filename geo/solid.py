@@ -41,7 +41,6 @@ def solid(name: str, body: Prism, openings: Sequence[Prism] = ()) -> tuple[str, 
     ----------
     name : str
         What it is, for error messages.
-    body : Prism
     openings : sequence of Prism
         They may reach beyond the body, and overlap.
 
@@ -90,10 +89,7 @@ def _prism(prism: Prism) -> int:
 def _step_text() -> str:
     """Return the model as the text of a STEP file.
 
-    Raises
-    ------
-    OutputError
-        If the temporary file cannot be written. Gmsh itself does not notice a full disk.
+    OutputError if the temporary file cannot be written. Gmsh itself does not notice a full disk.
     """
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     with TemporaryDirectory(prefix="halbach-fe-") as folder:
@@ -221,22 +217,14 @@ class Group:
 
 @dataclass(frozen=True)
 class Occurrence:
-    """A part in its place.
-
-    Attributes
-    ----------
-    part : Solid or Group
-    name : str
-    origin : ndarray, shape (3,), in mm
-        Place of the part's origin.
-    axes : ndarray, shape (3, 3)
-        Axes of the part as columns.
-    """
+    """A part in its place."""
 
     part: Solid | Group
     name: str
     origin: Floats = field(default_factory=lambda: np.zeros(3))
+    """Place of the part's origin. Shape (3,), in mm."""
     axes: Floats = field(default_factory=lambda: np.eye(3))
+    """Axes of the part as columns. Shape (3, 3)."""
 
 
 class _Product(NamedTuple):

@@ -806,7 +806,7 @@ def tolerance(
     check_objective(magnet, reference, limit_units, limit_ppm)
     measured = None if blocks is None else prior_from_blocks(magnet, blocks)
     model, generator = objective_of(magnet, reference, session), np.random.default_rng(seed)
-    prior = measured.gaussian if measured else assembled_prior(magnet, model.nominal)
+    prior = assembled_prior(magnet, model.nominal, measured.gaussian if measured else None)
     found = (predict_tolerance(model, magnet, prior, draws, generator, limit_units)
              if isinstance(model, MultipoleModel) else
              predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm))

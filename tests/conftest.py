@@ -5,11 +5,14 @@ from __future__ import annotations
 import copy
 import functools
 import gc
+import importlib.util
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -135,6 +138,17 @@ def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
             table = table.setdefault(part, {})
         table[last] = value
     return result
+
+
+def module_of(name: str, script: Path) -> ModuleType:
+    """A script as a module, as if it were run in its folder."""
+    spec = importlib.util.spec_from_file_location(name, script)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # for its dataclasses
+    sys.path.insert(0, str(script.parent))
+    spec.loader.exec_module(module)
+    sys.path.remove(str(script.parent))
+    return module
 
 
 @pytest.fixture(scope="session")

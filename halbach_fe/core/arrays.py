@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from numbers import Number
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+T = TypeVar("T", bound=np.generic)
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -55,11 +56,23 @@ def unit_circle(angles: ArrayLike) -> Floats:
     return np.stack([np.cos(angles), np.sin(angles), np.zeros(np.shape(angles))], axis=-1)
 
 
+def slices(count: int, most: int) -> list[slice]:
+    """Return slices that divide ``count`` rows into parts of at most ``most``, in order."""
+    return [slice(first, min(first + most, count)) for first in range(0, count, most)]
+
+
+def spread(rows: NDArray[T], most: int) -> NDArray[T]:
+    """Return at most so many of some rows (n, ...), from the first to the last, evenly spread."""
+    return rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+
+
 AXIS = re.compile(r"[bB]?_?([xyzXYZ])(?![A-Za-z])")
 """How the name of a column of a DataFrame begins that is of an axis: x, x_m, Bx, Bx_T."""
 
-OTHER_UNIT = re.compile(r"(?<![A-Za-z])(mm|cm|um|inch|mT|uT|nT|k?G|gauss)\W?$")
-"""How such a name ends that states another unit than m or T: x_mm, Bx [mT]."""
+OTHER_UNIT = re.compile(
+    r"(?<![a-z])([kcdmunpµμ](m|metres?|meters?|t)|(milli|micro|centi|kilo)\w+|microns?|in(ch|ches)?"
+    r"|ft|mils?|[km]?(g|gs|gauss|oe|oersted)|[km]?a */ *m)\W*$", re.IGNORECASE)
+"""How such a name ends that states another unit than m or T: x_mm, Bx [mT], Bx (kA/m)."""
 
 
 AXIS_DIMENSION = re.compile(r"components?|ax[ei]s|xyz|coord\w*|cartesian|directions?|space")
@@ -69,8 +82,9 @@ AXIS_DIMENSION = re.compile(r"components?|ax[ei]s|xyz|coord\w*|cartesian|directi
 def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     """Return a copy of numbers as floats, NaN where an array is masked.
 
-    A DataArray, DataFrame or Series whose labels name x, y and z has those of ``axes`` along the
-    last dimension; so has a DataArray without labels if a dimension is called component or axis.
+    A DataArray, DataFrame, Series, dict or structured array whose labels name x, y and z has those
+    of ``axes`` along the last dimension; so has a DataArray without labels if a dimension is called
+    component or axis.
     Whatever says nothing of itself is taken as it is: x, y and z along its last dimension.
 
     Raises
@@ -88,7 +102,10 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     given: Any = np.ma.asarray(values)
     if given.dtype.kind in "Mmb":  # whose numbers are nanoseconds, or 0 and 1
         raise TypeError("times" if given.dtype.kind in "Mm" else "true and false")
-    return np.array(np.ma.filled(given.astype(float), np.nan))
+    try:
+        return np.array(np.ma.filled(given.astype(float), np.nan))
+    except TypeError:  # a generator, an empty dict, a list of dicts
+        raise TypeError("other than numbers; make a list or an array of them") from None
 
 
 def of_length(vectors: Floats, length: Floats) -> Floats:
@@ -100,7 +117,16 @@ def of_length(vectors: Floats, length: Floats) -> Floats:
 
 
 def _labelled(values: Any) -> Any:
-    """Return a table or series (of pandas, polars) as a DataArray; anything else as it is."""
+    """Return columns by name (a dict, a Dataset, a structured array, a table or series of pandas
+    or polars) as a DataArray; anything else as it is.
+    """
+    names = list(getattr(values, "data_vars", values)) if isinstance(values, Mapping) else (
+        list(getattr(getattr(values, "dtype", None), "names", None) or ()))
+    if names:
+        columns = np.broadcast_arrays(*(plain(values[name]) for name in names))
+        dims = [*map("axis {}".format, range(columns[0].ndim)), "column"]
+        return xr.DataArray(np.stack(columns, axis=-1), dims=dims,
+                            coords={"column": list(map(str, names))})
     if isinstance(values, xr.DataArray) or not hasattr(values, "to_numpy"):
         return values
     numbers = values.to_numpy()

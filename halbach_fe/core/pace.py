@@ -23,24 +23,16 @@ QUIET_S = 10.0
 
 @dataclass
 class Pace:
-    """Reports the progress of the step under way, and tells when the time is up.
-
-    Attributes
-    ----------
-    say : callable
-        Takes a line of text.
-    show : callable, optional
-        Takes the numbers of finished and of all parts of a step, for a progress bar.
-    limit_s : float, optional
-        Time limit in s from the beginning.
-    clock : callable
-        Returns the time in s.
-    """
+    """Reports the progress of the step under way, and tells when the time is up."""
 
     say: Say
+    """Takes a line of text."""
     show: Progress | None = None
+    """Takes the numbers of finished and of all parts of a step, for a progress bar."""
     limit_s: float | None = None
+    """Time limit in s from the beginning."""
     clock: Callable[[], float] = time.monotonic
+    """Returns the time in s."""
     _step: str = ""
     _begun: float = field(init=False)
     _step_begun: float = field(init=False)

@@ -96,47 +96,31 @@ def _inside(name: str) -> str:
 
 
 class Record(BaseModel):
-    """The content of run.json.
-
-    Attributes
-    ----------
-    command, study : str
-        What the folder belongs to; ``study`` is empty for a command without a study.
-    files : dict of str to str
-        SHA-256 of every result, by its path within the folder.
-    inputs : dict of str to str
-        SHA-256 of every file that the run was given, by its path.
-    named : dict of str to str
-        Path of an input by the word that stands for it in commands: STUDY, MAP, BLOCKS, POSTERIOR.
-    ended : str
-        When the run ended, in ISO 8601 (UTC); empty until it has ended well.
-    kept : list of str or None
-        Those of the files `KEPT` that runs have written; None in records of earlier versions.
-    writing : dict of str to str
-        SHA-256 of a result that is about to appear. A run that is killed then leaves it, or the one
-        before it.
-    """
+    """The content of run.json."""
 
     model_config = ConfigDict(extra="forbid")
     command: str
     study: str
+    """What the folder belongs to; ``study`` is empty for a command without a study."""
     files: dict[Annotated[str, AfterValidator(_inside)], str] = {}
+    """SHA-256 of every result, by its path within the folder."""
     inputs: dict[str, str] = {}
+    """SHA-256 of every file that the run was given, by its path."""
     named: dict[str, str] = {}
+    """Path of an input by the word that stands for it in commands: STUDY, MAP, BLOCKS,
+    POSTERIOR."""
     ended: str = ""
+    """When the run ended, in ISO 8601 (UTC); empty until it has ended well."""
     kept: list[Annotated[str, AfterValidator(_inside)]] | None = None
+    """Those of the files `KEPT` that runs have written; None in records of earlier versions."""
     writing: dict[Annotated[str, AfterValidator(_inside)], str] = {}
+    """SHA-256 of a result that is about to appear. A run that is killed then leaves it, or the one
+    before it."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """The results of a run that has ended.
-
-    Attributes
-    ----------
-    folder : Path
-    record : Record
-    """
+    """The results of a run that has ended."""
 
     folder: Path
     record: Record

@@ -34,30 +34,19 @@ TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")
 
 @dataclass(frozen=True)
 class Kind:
-    """Blocks that are ordered together, as they are equal from their own axes.
-
-    Attributes
-    ----------
-    number : int
-        From 1.
-    sizes : dict
-        Columns ``shape``, ``size_z_m`` and others of a table of free blocks.
-    solid : Prism
-        A block in its own frame.
-    direction : ndarray, shape (3,)
-        Unit vector of the magnetization along its own axes.
-    remanence_T : float
-    material : str or None
-        Grade.
-    count : int
-    """
+    """Blocks that are ordered together, as they are equal from their own axes."""
 
     number: int
+    """From 1."""
     sizes: dict[str, Any]
+    """Columns ``shape``, ``size_z_m`` and others of a table of free blocks."""
     solid: Prism
+    """A block in its own frame."""
     direction: Floats
+    """Unit vector of the magnetization along its own axes. Shape (3,)."""
     remanence_T: float
     material: str | None
+    """Grade."""
     count: int
 
     @property
@@ -105,31 +94,21 @@ class Kind:
 
 @dataclass(frozen=True)
 class AssembledBlock:
-    """A block in its place.
-
-    Attributes
-    ----------
-    block : MagnetBlock
-        In a frame of its own.
-    kind : Kind
-    serial : str
-        Serial number; empty if it is not known.
-    measured_axes : ndarray, shape (3, 3), or None
-        Axes in which the moment of a measured block is given, as columns; None for a block whose
-        magnetization is inverted. They are turned with the block.
-    plate : Plate or None
-        The plate that holds it.
-    turn_deg : tuple of 3 floats
-        Rotation vector, along its own axes, by which a sorted block is turned in its place from how
-        it was measured.
-    """
+    """A block in its place."""
 
     block: MagnetBlock
+    """In a frame of its own."""
     kind: Kind
     serial: str
+    """Serial number; empty if it is not known."""
     measured_axes: Floats | None
+    """Axes in which the moment of a measured block is given, as columns; None for a block whose
+    magnetization is inverted. They are turned with the block. Shape (3, 3)."""
     plate: Plate | None = None
+    """The plate that holds it."""
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector, along its own axes, by which a sorted block is turned in its place from how
+    it was measured."""
 
     @property
     def up(self) -> str:
@@ -369,10 +348,7 @@ def _of_table(
 
     The table names the place that a block was made for.
 
-    Raises
-    ------
-    MeasurementError
-        If the table does not fit the study, or says nothing about places.
+    MeasurementError if the table does not fit the study, or says nothing about places.
     """
     if table is None:
         return {}, {}

@@ -63,44 +63,34 @@ LINEAR = 0.25, 2.0
 
 @dataclass(frozen=True)
 class Cells:
-    """Blocks cut into small cells, layer by layer.
-
-    Attributes
-    ----------
-    vertices : ndarray, shape (v, 3), in m
-    corners : ndarray, shape (cells, 8), or in 2D (cells, 4)
-        Numbers of the vertices of each cell, in VTK's order.
-    block : ndarray, shape (cells,)
-        Number of the block that each cell belongs to, counted from 0.
-    middles : ndarray, shape (cells, 3), in m
-        Centres of the cells, where H is computed.
-    volumes : ndarray, shape (cells,), in m^3 (in 2D areas in m^2)
-    """
+    """Blocks cut into small cells, layer by layer."""
 
     vertices: Floats
+    """Shape (v, 3), in m."""
     corners: Ints
+    """Numbers of the vertices of each cell, in VTK's order.
+    Shape (cells, 8), or in 2D (cells, 4)."""
     block: Ints
+    """Number of the block that each cell belongs to, counted from 0. Shape (cells,)."""
     middles: Floats
+    """Centres of the cells, where H is computed. Shape (cells, 3), in m."""
     volumes: Floats
+    """Shape (cells,), in m^3 (in 2D areas in m^2)."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places anywhere in cells that are in an opposed field, and the middles of other ones.
-
-    Attributes
-    ----------
-    cell : ndarray, shape (n,)
-        Number of the cell of each place.
-    volumes : ndarray, shape (n,), in m^3 (in 2D areas in m^2)
-        What of the volume of its cell each stands for.
-    along : ndarray, shape (n,), in A/m
-        H along the magnetization.
-    """
+    """Places anywhere in cells that are in an opposed field, and the middles of other ones."""
 
     cell: Ints
+    """Number of the cell of each place. Shape (n,)."""
     volumes: Floats
+    """What of the volume of its cell each stands for. Shape (n,), in m^3 (in 2D areas in m^2)."""
     along: Floats
+    """H along the magnetization. Shape (n,), in A/m."""
+    outside: Floats
+    """The part of it that external sources make which do not change with the temperature: all but
+    neighbours. Shape (n,), in A/m."""
 
 
 @dataclass(frozen=True)
@@ -168,14 +158,17 @@ class DemagnetizationMap(ShownInNotebook):
     def share_beyond(self, temperature_C: Floats) -> Floats:
         """Return the share of the volume past the knee, for temperatures (t,) in °C.
 
-        H is assumed to be proportional to the remanence when the temperature changes. This is exact
-        without iron and for iron of constant permeability.
+        H is assumed to be proportional to the remanence when the temperature changes, but for that
+        of external sources. This is exact without iron, and for iron of constant permeability
+        unless these magnetize it.
         """
         weight = self.places.volumes / self.places.volumes.sum()
         grown = (remanence_factor(self.material, temperature_C)
                  / remanence_factor(self.material, self.material.temperature_C))
         limit = knee(self.material, temperature_C)
-        return np.array([weight[self.places.along * g < -h].sum()
+        outside = self.places.outside
+        own = self.places.along - outside
+        return np.array([weight[own * g + outside < -h].sum()
                          for g, h in zip(grown, limit, strict=True)])
 
     @property
@@ -190,14 +183,15 @@ class DemagnetizationMap(ShownInNotebook):
         every one above absolute zero. Where `worst_when_cold`, it is the lowest such temperature,
         and the signs of the infinities are the others.
         """
-        material = self.material
-        at_reference = -self.places.along / remanence_factor(material, material.temperature_C)
-        # solve -along (1 + alpha d) = knee (1 + beta d) for the temperature difference d of each
-        # place, where alpha and beta are the coefficients of remanence and coercivity
+        material, outside = self.material, self.places.outside
+        at_reference = (outside - self.places.along) / remanence_factor(
+            material, material.temperature_C)
+        # solve -own (1 + alpha d) - outside = knee (1 + beta d) for the temperature difference d of
+        # each place, where alpha and beta are the coefficients of remanence and coercivity
         rate = (at_reference * material.remanence_coefficient_per_K
                 - knee(material, material.reference_temperature_C)
                 * material.coercivity_coefficient_per_K)
-        spare = knee(material, material.reference_temperature_C) - at_reference
+        spare = knee(material, material.reference_temperature_C) - at_reference + outside
         sign = -1 if self.worst_when_cold else 1
         with np.errstate(divide="ignore", invalid="ignore"):
             limit = np.where(sign * rate > 0, spare / rate,
@@ -265,8 +259,6 @@ def demagnetization_map(
 
     Parameters
     ----------
-    magnet : Magnet
-    session : Session
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
         have about the same length, but are no fewer: through a thin block H varies most.
@@ -300,14 +292,17 @@ def demagnetization_map(
     opposed = np.einsum("nc,nc->n", field + from_outside, easy[cells.block]) < OPPOSED * strength
     cell, points = _anywhere(cells, np.flatnonzero(opposed))
     number = np.append(cells.block, cells.block[cell])
+    everywhere = np.vstack([cells.middles, points])
     field = _field_strength(
-        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, None)]),
-        np.vstack([cells.middles, points]), number, session)
-    along, other = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
+        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, None)]), everywhere, number,
+        session)
+    fixed = external_field(warm.with_(external__neighbours=()), everywhere) / MU_0
+    along, outside = (np.einsum("nc,nc->n", each, easy[number]) for each in (field, fixed))
     cell = np.append(np.flatnonzero(~opposed), cell)
-    return DemagnetizationMap(magnet, material, blocks, cells, along, Places(
+    used = np.append(np.flatnonzero(~opposed), np.arange(len(opposed), len(number)))
+    return DemagnetizationMap(magnet, material, blocks, cells, along[:len(opposed)], Places(
         cell, (cells.volumes / np.maximum(1, np.bincount(cell, minlength=len(opposed))))[cell],
-        np.append(along[~opposed], other)))
+        along[used], outside[used]))
 
 
 def _anywhere(cells: Cells, numbers: Ints) -> tuple[Ints, Floats]:
@@ -352,12 +347,7 @@ Cut = tuple[Floats, Ints, Floats, Floats]
 
 
 def _check_memory(count: int, across: int) -> None:
-    """Refuse more cells than fit into memory.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse more cells than fit into memory."""
     bytes_each = 800  # of 0.44 million cells 765 were measured
     needed, left = count * bytes_each / 2**30, available_memory()
     if left is not None and needed > left:
@@ -517,12 +507,7 @@ def _by_moments(magnet: Magnet) -> bool:
 
 
 def _check_equal_rings(magnet: Magnet) -> None:
-    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D."""
     if magnet.dimension == 3 and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings for a map of the "

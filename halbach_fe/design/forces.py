@@ -81,20 +81,15 @@ DENSITY_KG_PER_M3 = 7500.0
 
 @dataclass(frozen=True)
 class Loads:
-    """Forces and torques on the blocks of a magnet.
-
-    Attributes
-    ----------
-    force_N, torque_Nm : ndarray, shape (blocks, 3)
-        Along x, y and z of the magnet; torques about the middles of the blocks.
-    error_N, error_Nm : ndarray, shape (blocks,)
-        Error bars of the quadrature.
-    """
+    """Forces and torques on the blocks of a magnet."""
 
     force_N: Floats
     torque_Nm: Floats
+    """Along x, y and z of the magnet; torques about the middles of the blocks.
+    Shape (blocks, 3)."""
     error_N: Floats
     error_Nm: Floats
+    """Error bars of the quadrature. Shape (blocks,)."""
 
     @property
     def magnitude(self) -> Floats:
@@ -104,21 +99,14 @@ class Loads:
 
 @dataclass(frozen=True)
 class IronLoads:
-    """Forces on bodies of iron.
-
-    Attributes
-    ----------
-    names : tuple of str
-        ``iron 1`` for the first body; bodies that feel one force together are one name.
-    force_N : ndarray, shape (bodies, 3)
-        Along x, y and z of the magnet.
-    error_N : ndarray, shape (bodies,)
-        Error bars.
-    """
+    """Forces on bodies of iron."""
 
     names: tuple[str, ...]
+    """``iron 1`` for the first body; bodies that feel one force together are one name."""
     force_N: Floats
+    """Along x, y and z of the magnet. Shape (bodies, 3)."""
     error_N: Floats
+    """Error bars. Shape (bodies,)."""
 
 
 @dataclass(frozen=True)
@@ -416,22 +404,15 @@ def _reach(block: MagnetBlock) -> float:
 
 @dataclass(frozen=True)
 class Charges:
-    """Gauss points on the faces of blocks, and the magnetic charges that they stand for.
-
-    Attributes
-    ----------
-    points, normals : ndarray, shape (n, 3)
-        Along the axes of the magnet; points in m, normals outward.
-    charge : ndarray, shape (n,), in A m
-        (J . n) dS / mu_0.
-    owner : ndarray of int, shape (n,)
-        Number of the block.
-    """
+    """Gauss points on the faces of blocks, and the magnetic charges that they stand for."""
 
     points: Floats
     normals: Floats
+    """Along the axes of the magnet; points in m, normals outward. Shape (n, 3)."""
     charge: Floats
+    """(J . n) dS / mu_0. Shape (n,), in A m."""
     owner: Ints
+    """Number of the block. Shape (n,)."""
 
     @classmethod
     def of(cls, blocks: Sequence[MagnetBlock], order: int) -> Charges:
@@ -590,7 +571,6 @@ def iron_loads(magnet: Magnet, charges: Sequence[tuple[Floats, Floats]],
 
     Parameters
     ----------
-    magnet : Magnet
     charges : sequence of two pairs
         Points (n, 3) in m on the faces of the blocks, and their magnetic charges (n,) in A m: of a
         good quadrature, and of a coarser one for the error bar.

@@ -42,7 +42,6 @@ def digits(
 
     Parameters
     ----------
-    text : str
     height : float, in m
     radius, angle : float, in m and rad
         Its middle.
@@ -86,60 +85,39 @@ class CannotBeMadeError(Exception):
 
 @dataclass(frozen=True)
 class HeldBlock:
-    """A block that stands upright.
-
-    Attributes
-    ----------
-    number : int
-        Its number among all blocks.
-    name : str
-    prism : Prism
-    direction : ndarray, shape (3,)
-        Unit vector of its magnetization.
-    """
+    """A block that stands upright."""
 
     number: int
+    """Its number among all blocks."""
     name: str
     prism: Prism
     direction: Floats
+    """Unit vector of its magnetization. Shape (3,)."""
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate, of which one or more are made.
-
-    Attributes
-    ----------
-    number : int
-        From 1; it is engraved.
-    body : Prism
-        The plate without openings; its lower face is at z = 0.
-    openings : tuple of Prism
-        Bore, pockets, holes and engraved bars. Those below z = 0 go through.
-    bars : tuple of Prism
-        Those of the openings that are the engraved number.
-    heights_m : tuple of float
-        z of the lower face of every copy.
-    blocks : tuple of tuple of int
-        Numbers of the blocks in every copy.
-    floor_m : float
-        Thickness below the lowest block; 0 if pockets go through.
-    wall_m : float
-        Thickness of the thinnest wall.
-    inner_radius_m, outer_radius_m : float
-        Of the plate; the inner one is 0 without a bore.
-    """
+    """A plate, of which one or more are made."""
 
     number: int
+    """From 1; it is engraved."""
     body: Prism
+    """The plate without openings; its lower face is at z = 0."""
     openings: tuple[Prism, ...]
+    """Bore, pockets, holes and engraved bars. Those below z = 0 go through."""
     heights_m: tuple[float, ...]
+    """z of the lower face of every copy."""
     blocks: tuple[tuple[int, ...], ...]
+    """Numbers of the blocks in every copy."""
     floor_m: float
+    """Thickness below the lowest block; 0 if pockets go through."""
     wall_m: float
+    """Thickness of the thinnest wall."""
     inner_radius_m: float
     outer_radius_m: float
+    """Of the plate; the inner one is 0 without a bore."""
     bars: tuple[Prism, ...] = ()
+    """Those of the openings that are the engraved number."""
 
     @property
     def thickness_m(self) -> float:
@@ -172,7 +150,6 @@ def plates(
     ----------
     groups : sequence of sequence of HeldBlock
         From below.
-    holder : Holder
     iron : sequence of IronSolid
         Bodies that plates have to leave room for.
     asked : str or None
@@ -225,25 +202,17 @@ def _refuse(error: CannotBeMadeError, asked: str | None) -> None:
 
 @dataclass(frozen=True)
 class _Frame:
-    """What all plates of a magnet have in common; lengths are in m.
-
-    Attributes
-    ----------
-    inner, outer : float
-        Radii of the plates.
-    pockets : float
-        Radius around all pockets.
-    floor : float
-        Thickness below the blocks.
-    rods : tuple of Prism
-        Holes for rods.
-    """
+    """What all plates of a magnet have in common; lengths are in m."""
 
     inner: float
     outer: float
+    """Radii of the plates."""
     pockets: float
+    """Radius around all pockets."""
     floor: float
+    """Thickness below the blocks."""
     rods: tuple[Prism, ...]
+    """Holes for rods."""
 
 
 def _frame(
@@ -252,10 +221,7 @@ def _frame(
 ) -> _Frame:
     """Return what plates of a magnet have in common.
 
-    Raises
-    ------
-    CannotBeMadeError
-        If there is no room for plates.
+    CannotBeMadeError if there is no room for plates.
     """
     limits = [(min(block.prism.z_min for block in group), max(block.prism.z_max for block in group))
               for group in groups]
@@ -329,12 +295,7 @@ def _plate(
     group: Sequence[HeldBlock], pockets: Mapping[int, Prism], holder: Holder, frame: _Frame,
     iron: Sequence[IronSolid],
 ) -> Plate:
-    """Return the plate of a group, without its number.
-
-    Raises
-    ------
-    CannotBeMadeError
-    """
+    """Return the plate of a group, without its number."""
     low = min(block.prism.z_min for block in group) - frame.floor
     top = max(block.prism.z_max for block in group) - low
     thickness = holder.thickness_m or top

@@ -14,51 +14,55 @@ least 1 - 1/e of the largest possible gain (A. Krause et al., J. Mach. Learn. Re
 For values of interest, with the roots V of their covariance and C of that of the parameters given
 the positions chosen so far, a position with the response G takes ``tr(V C G^T (I + G C G^T)^-1 G C
 V^T)`` off the sum of their variances.
+
+What else the study states as open is beside the parameters, as in an update: terms and amplitudes
+of the instrument, blocks of neighbours, and the solver's error. Information about these does not
+count: the gain is that about all together, less what the readings tell of them if the parameters
+are known.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import xarray as xr
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, box_middle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.inference.infer import neighbour_columns
+from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns, joined
+from halbach_fe.inference.readings import Readings, read_campaign
+from halbach_fe.measurement.campaign import ONLY_MAP, Map
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.instrument import sensor_matrix, sensor_positions
+from halbach_fe.measurement.instrument_terms import seen
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.routes import check_points
+from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior
+from halbach_fe.study.inference import Inference, InstrumentSd
+from halbach_fe.study.measurement import Instrument
 
 
 @dataclass(frozen=True)
 class UnknownDeviation:
-    """The rms uncertainty of the deviation of |B| in the study's region, in ppm.
-
-    Attributes
-    ----------
-    region : Region
-    prior : float
-        Without any readings.
-    planned : ndarray, shape (count,)
-        After the first 1, 2, ... chosen positions.
-    baseline : ndarray
-        After the evenly spread subsets of the study's positions.
-    """
+    """The rms uncertainty of the deviation of |B| in the study's region, in ppm."""
 
     region: Region
     prior: float
+    """Without any readings."""
     planned: Floats
+    """After the first 1, 2, ... chosen positions. Shape (count,)."""
     baseline: Floats
+    """After the evenly spread subsets of the study's positions."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +143,8 @@ class MeasurementPlan(ShownInNotebook):
 def plan_measurement(magnet: Magnet, session: Session, count: int | None = None) -> MeasurementPlan:
     """Choose positions for a study's next measurement.
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of positions to choose. Default: the study's ``plan.points``, else the number of
-        positions that the study measures.
+    ``count``: number of positions to choose. Default: the study's ``plan.points``, else the number
+    of positions that the study measures.
 
     Raises
     ------
@@ -154,32 +155,37 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     baseline = points_from(magnet.study.observation.positions)
     candidates, wanted = _candidates(magnet, baseline, count)
     points = np.vstack([baseline, candidates])
-    # the order in which they would be measured is not known yet
-    steady = magnet.study.instrument.with_(lag_m=0.0)
-    observation = observe(magnet.study.with_(instrument=steady), points,
-                          np.ones_like(points, bool))
-    noise = reading_noise(magnet, observation, xr.Dataset())
+    readings, one, field = _readings(magnet, points, session.within("instrument"))
+    observation = readings.observation
     model = response_matrix(magnet, observation, session)
-    errors = noise.with_independent_errors(model.error)
+    beside = _beside(magnet, readings, one, field, model.shared_error)
+    errors = readings.noise.with_independent_errors(model.error)
     prior = study_prior(magnet, len(model.parameters) - len(magnet.parameter_names))
+    everything = joined(prior, *np.repeat([[0.0], [1.0]], beside.shape[1], axis=1))
+    whole = np.hstack([model.whole, beside])
     size = len(observation) // len(points)  # readings per point; only these may be correlated
-    whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
+    whitened = errors.whiten(whole @ everything.root).reshape(len(points), size, -1)
+    others = errors.whiten(beside).reshape(len(points), size, -1)
     values = _values(magnet, prior, session.within("objective"))
-    choice = greedy(whitened[len(baseline):], wanted, None if values is None else values.root)
+    root = np.zeros((0, whitened.shape[2])) if values is None else np.pad(
+        values.root, ((0, 0), (0, beside.shape[1])))
+    choice = greedy(whitened[len(baseline):], wanted, None if values is None else root,
+                    others[len(baseline):])
     chosen = choice.chosen
     same = min(wanted, len(baseline))
     # number of subsets, of increasing size, of the study's positions whose information is computed
     curve_points = 100
     counts = np.unique(np.append(np.linspace(1, len(baseline), curve_points).astype(int), same))
-    subsets = [whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2])
-               for number in counts]
+    subsets, of_others = ([each[spread(len(baseline), number)].reshape(
+        number * size, each.shape[2]) for number in counts] for each in (whitened, others))
     rows = np.arange(len(observation)).reshape(len(points), size)
 
     def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
         # for readings as the prior expects: the model is linear, so that others change no sd
-        matrix = model.matrix[index]
-        return posterior(matrix, matrix @ prior.mean, errors.subset(index), prior).sd
+        matrix = whole[index]
+        return posterior(matrix, matrix @ everything.mean, errors.subset(index), everything).sd[
+            :len(model.parameters)]
 
     deviation = None
     if values is not None:
@@ -188,26 +194,77 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
         deviation = UnknownDeviation(
             default_region(magnet), np.sqrt(before),
             np.sqrt(np.maximum(before - choice.fall, 0.0)),
-            np.sqrt(np.maximum([variance_left(subset, values.root) for subset in subsets], 0.0)))
+            np.sqrt(np.maximum([variance_left(subset, root) for subset in subsets], 0.0)))
     return MeasurementPlan(
         magnet, model.parameters, candidates, candidates[chosen], baseline, choice.gain, counts,
-        np.array([information(subset) for subset in subsets]), model.nominal, prior.sd,
+        np.array([information(subset) - information(other) for subset, other in zip(
+            subsets, of_others, strict=True)]), model.nominal, prior.sd,
         sd_after(chosen + len(baseline)), sd_after(spread(len(baseline), same)), deviation)
+
+
+def _readings(
+    magnet: Magnet, points: Floats, session: Session
+) -> tuple[Readings, Map, Callable[[Floats], Floats]]:
+    """Return the readings of a map of the nominal magnet at points (n, 3) in m, the map, and the
+    nominal field, a function of points (n, 3) in m.
+
+    The order in which they would be measured is not known yet: there is neither lag nor drift.
+    """
+    study = magnet.study
+    steady = study.instrument.with_(**{key: getattr(Instrument(), key) for key in (
+        "lag_m", "length_unit_m", "flux_density_unit_T", "position_axes", "field_axes")})
+    study = study.with_(
+        maps=(), inference=Inference(), instrument=steady,
+        instrument_sd=study.instrument_sd.with_(drift_T=0.0),
+        uncertain=tuple(one for one in study.uncertain if not any(
+            name.startswith("maps[") for name in one.change)))
+    is_open = study.instrument_sd != InstrumentSd() or any(
+        each.is_of_instrument for each in study.uncertain)
+    field = field_function(magnet, session) if is_open else _any_field
+    sensors = sensor_positions(steady, points)
+    shown = seen(sensor_matrix(steady), field(sensors.reshape(-1, 3)).reshape(sensors.shape))
+    middle = box_middle(points)
+    one = Map(ONLY_MAP, field_map(points, shown), study, middle, middle, *3 * (ONLY_MAP,))
+    return read_campaign(magnet.with_study(study), [one]), one, field
+
+
+def _any_field(points: Floats) -> Floats:
+    """Return a field (n, 3) in T that stands for one on which nothing depends."""
+    return 0 * points + [1.0, 1.0, 0.0]
+
+
+def _beside(
+    magnet: Magnet, readings: Readings, one: Map, field: Callable[[Floats], Floats],
+    shared_error: Floats,
+) -> Floats:
+    """Return readings (n, k) in T per prior standard deviation of what is open beside the
+    parameters of the magnet; ``shared_error`` (e, n) in T is the solver's.
+    """
+    terms = OpenTerms.of([one])
+    found = [shared_error.reshape(-1, len(readings.values)).T,
+             neighbour_columns(magnet, [one], readings)]
+    if len(terms):
+        found.append(terms.columns(field, [one], readings) * terms.sd)
+    if any(each.is_of_instrument for each in one.study.uncertain):
+        found.append(amplitude_columns(one.study, field, [one], readings))
+    return np.hstack(found)
 
 
 def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:
     """Return the candidate positions (n, 3) in m and the number of positions to choose.
 
-    Raises
-    ------
-    StudyError
-        See `plan_measurement`.
+    StudyError: See `plan_measurement`.
     """
     if magnet.study.observation.quantity != "flux_density":
         raise StudyError(
             f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
             f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
             "flux densities.")
+    if magnet.study.noise is None or not magnet.study.noise.regions:
+        raise StudyError(
+            f"Input `noise` of study {magnet.name} must say how noisy the readings will be, since "
+            "no map is there that has sigma_T; instead it is missing. Add [[noise.regions]] to "
+            "the study.")
     sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
     places: list[Floats] = [points_from(positions) for positions in sets]
     candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
@@ -264,24 +321,45 @@ def variance_left(design: Floats, values: Floats) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """Positions in the order of their choice, and what they tell.
-
-    Attributes
-    ----------
-    chosen : ndarray of int, shape (count,)
-        Indices of the positions.
-    gain : ndarray, shape (count,)
-        Information gain in nats of the positions chosen up to and including each.
-    fall : ndarray, shape (count,)
-        What they take off the sum of the variances of the values of interest; 0 without such.
-    """
+    """Positions in the order of their choice, and what they tell."""
 
     chosen: Ints
+    """Indices of the positions. Shape (count,)."""
     gain: Floats
+    """Information gain in nats of the positions chosen up to and including each. Shape (count,)."""
     fall: Floats
+    """What they take off the sum of the variances of the values of interest; 0 without such.
+    Shape (count,)."""
 
 
-def greedy(design: Floats, count: int, values: Floats | None = None) -> Choice:
+class _Told:
+    """What positions chosen so far tell of whitened parameters, by a design (positions, k, m)."""
+
+    def __init__(self, design: Floats) -> None:
+        self.design, self.covariance = design, np.eye(design.shape[2])
+        # covariance of the noise-free readings at each position, given the positions chosen so far
+        self.predicted = np.einsum("pkm,plm->pkl", design, design)
+
+    @property
+    def spread(self) -> Floats:
+        """Covariance (positions, k, k) of the readings at each position."""
+        return np.asarray(np.eye(self.design.shape[1]) + self.predicted)
+
+    def choose(self, number: int) -> tuple[Floats, Floats]:
+        """Choose a position; return the root (m, k) of what it takes off the covariance, and what
+        that changes in all readings (positions, k, k).
+        """
+        reduction = np.linalg.solve(
+            np.linalg.cholesky(self.spread[number]), self.design[number] @ self.covariance).T
+        self.covariance -= reduction @ reduction.T
+        reduction_at = self.design @ reduction
+        self.predicted -= reduction_at @ reduction_at.transpose(0, 2, 1)
+        return reduction, reduction_at
+
+
+def greedy(
+    design: Floats, count: int, values: Floats | None = None, beside: Floats | None = None
+) -> Choice:
     """Choose positions one by one, each for the largest gain of information or fall of variance.
 
     Parameters
@@ -293,28 +371,24 @@ def greedy(design: Floats, count: int, values: Floats | None = None) -> Choice:
     values : ndarray, shape (v, m), optional
         Root of the covariance of the values whose variances are to fall, in terms of the same
         whitened parameters. Without it, the information about all parameters counts.
+    beside : ndarray, shape (positions, k, q), optional
+        The part of the design of those parameters about which information does not count.
     """
-    size = design.shape[1]
-    covariance = np.eye(design.shape[2])
-    # covariance of the noise-free readings at each position, given the positions chosen so far
-    predicted = np.einsum("pkm,plm->pkl", design, design)
+    told, others = _Told(design), _Told(design[:, :, :0] if beside is None else beside)
     root = np.zeros((0, design.shape[2])) if values is None else values
     cross = np.einsum("vm,pkm->pvk", root, design)
     chosen: list[int] = []
     gains, falls = np.zeros(count), np.zeros(count)
     for number in range(count):
-        spread = np.eye(size) + predicted
-        gain = np.linalg.slogdet(spread)[1] / 2
+        spread = told.spread
+        gain = (np.linalg.slogdet(spread)[1] - np.linalg.slogdet(others.spread)[1]) / 2
         fall = np.einsum("pvk,pkv->p", cross, np.linalg.solve(spread, cross.swapaxes(1, 2)))
         score = gain.copy() if values is None else fall.copy()
         score[chosen] = -np.inf
         best = int(np.argmax(score))
         gains[number], falls[number] = gain[best], fall[best]
         chosen.append(best)
-        reduction = np.linalg.solve(  # (m, k)
-            np.linalg.cholesky(spread[best]), design[best] @ covariance).T
-        covariance -= reduction @ reduction.T
-        reduction_at = design @ reduction
-        predicted -= reduction_at @ reduction_at.transpose(0, 2, 1)
+        others.choose(best)
+        reduction, reduction_at = told.choose(best)
         cross -= np.einsum("vj,pkj->pvk", root @ reduction, reduction_at)
     return Choice(np.array(chosen), np.cumsum(gains), np.cumsum(falls))

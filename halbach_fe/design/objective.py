@@ -44,25 +44,17 @@ from halbach_fe.stats.gaussian import Gaussian, correlated_values
 
 @dataclass(frozen=True)
 class Deviations:
-    """Deviations of |B| in a region, with their uncertainty.
-
-    Attributes
-    ----------
-    main, main_sd : float
-        Mean of |B| in T and its standard deviation, including the solver's error.
-    mean : ndarray, shape (k,)
-        Means of the values whose squares sum to the mean square deviation, in ppm.
-    root : ndarray, shape (k, q)
-        Root of their covariance in ppm.
-    error : ndarray, shape (k,)
-        Error of the solver in ppm, which ``root`` does not include.
-    """
+    """Deviations of |B| in a region, with their uncertainty."""
 
     main: float
     main_sd: float
+    """Mean of |B| in T and its standard deviation, including the solver's error."""
     mean: Floats
+    """Means of the values whose squares sum to the mean square deviation, in ppm. Shape (k,)."""
     root: Floats
+    """Root of their covariance in ppm. Shape (k, q)."""
     error: Floats
+    """Error of the solver in ppm, which ``root`` does not include. Shape (k,)."""
 
     @property
     def expected_square(self) -> float:
@@ -91,28 +83,19 @@ class Deviations:
 
 @dataclass(frozen=True)
 class DeviationModel:
-    """The linear model ``(m, v) = offset + matrix p`` of mean and deviations of |B| in a region.
-
-    Attributes
-    ----------
-    homogeneity : HomogeneityModel
-        The field at all points of the region.
-    matrix : ndarray, shape (1 + k, parameters), in T m/A
-        Rows for the mean of |B|, and for values whose squares sum to the mean square of its
-        deviations.
-    offset : ndarray, shape (1 + k,), in T
-        The same of external fields.
-    error : ndarray, shape (1 + k,), in T
-        Error bar of the solver for these.
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetization.
-    """
+    """The linear model ``(m, v) = offset + matrix p`` of mean and deviations of |B| in a region."""
 
     homogeneity: HomogeneityModel
+    """The field at all points of the region."""
     matrix: Floats
+    """Rows for the mean of |B|, and for values whose squares sum to the mean square of its
+    deviations. Shape (1 + k, parameters), in T m/A."""
     offset: Floats
+    """The same of external fields. Shape (1 + k,), in T."""
     error: Floats
+    """Error bar of the solver for these. Shape (1 + k,), in T."""
     nominal: Floats
+    """Nominal magnetization. Shape (parameters,), in A/m."""
 
     @cached_property
     def nominal_main(self) -> float:
@@ -148,11 +131,7 @@ class DeviationModel:
 def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> DeviationModel:
     """Return the linear model of the deviations of |B| about the field of a magnet.
 
-    Parameters
-    ----------
-    model : HomogeneityModel
-    about : ndarray, shape (parameters,), in A/m, optional
-        Magnetizations of that magnet; by default the nominal ones.
+    ``about`` (parameters,) in A/m: magnetizations of that magnet; by default the nominal ones.
     """
     response = model.response
     inner = np.flatnonzero(model.weights > 0)
@@ -236,10 +215,8 @@ def objective_of(
 
     Parameters
     ----------
-    magnet : Magnet
     reference : MultipoleReference or None
         Radius, orders and z of multipoles, if the study asks for multipoles.
-    session : Session
     about : ndarray, shape (parameters,), in A/m, optional
         Magnetizations about which |B| is linearized; by default the nominal ones.
 

@@ -38,37 +38,28 @@ SAME_SIZE = 1e-6
 
 @dataclass(frozen=True)
 class Mounts:
-    """Slots of a magnet, and the data that decide which blocks fit them.
-
-    Attributes
-    ----------
-    places : tuple of (ring, slot)
-        Ring and slot of each slot, both counted from 1.
-    frames : ndarray, shape (slots, 3, 3)
-        Rotations from the own axes of a slot's shape to the axes of the magnet.
-    turns : ndarray, shape (turns, 3, 3)
-        Rotations of a block, in its own axes, that leave some shape unchanged. The first is the
-        identity.
-    allowed : ndarray of bool, shape (turns, slots)
-        Which of them leave the shape of the block in a slot unchanged.
-    designed : ndarray, shape (slots, 3)
-        Directions of the design magnetization of each slot, in own axes.
-    current : ndarray, shape (slots, 3)
-        Directions of the nominal magnetization of the block that is in each slot now, in own axes;
-        0 where the block is missing.
-    kinds, current_kinds : ndarray of int, shape (slots,)
-        Kind of block that the design requires in each slot, and kind of the block that is there
-        now. Blocks of the same shape, remanence and recoil permeabilities are of the same kind.
-    """
+    """Slots of a magnet, and the data that decide which blocks fit them."""
 
     places: tuple[tuple[int, int], ...]
+    """Ring and slot of each slot, both counted from 1. As (ring, slot)."""
     frames: Floats
+    """Rotations from the own axes of a slot's shape to the axes of the magnet.
+    Shape (slots, 3, 3)."""
     turns: Floats
+    """Rotations of a block, in its own axes, that leave some shape unchanged. The first is the
+    identity. Shape (turns, 3, 3)."""
     allowed: Bools
+    """Which of them leave the shape of the block in a slot unchanged. Shape (turns, slots)."""
     designed: Floats
+    """Directions of the design magnetization of each slot, in own axes. Shape (slots, 3)."""
     current: Floats
+    """Directions of the nominal magnetization of the block that is in each slot now, in own axes; 0
+    where the block is missing. Shape (slots, 3)."""
     kinds: Ints
     current_kinds: Ints
+    """Kind of block that the design requires in each slot, and kind of the block that is there now.
+    Blocks of the same shape, remanence and recoil permeabilities are of the same kind.
+    Shape (slots,)."""
 
     def fits(self, directions: Floats, kinds: Ints) -> Bools:
         """Return which blocks fit which slots, shape (turns, slots, blocks).
@@ -118,10 +109,8 @@ def mounts_of(magnet: Magnet) -> Mounts:
 def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
     """Return the rotations (n, 3, 3) that leave a shape unchanged; the first is the identity.
 
-    Parameters
-    ----------
-    sides : tuple of float, or None
-        Sides of a cuboid; None for a shape whose inner and outer face differ, such as a sector.
+    ``sides``: sides of a cuboid; None for a shape whose inner and outer face differ, such as a
+    sector.
     """
     turns = Rotation.create_group("O").as_matrix().round()
     if sides is None:
@@ -214,7 +203,6 @@ def remounted(
 
     Parameters
     ----------
-    magnet : Magnet
     moved : iterable of (int, int, ndarray)
         For each moved block, its new and its old slot (counted from 0, ring by ring), and the
         matrix (3, 3) that maps its magnetization in the old slot to that in the new slot, along

@@ -29,19 +29,12 @@ ROUNDING_M = 1e-9
 
 @dataclass(frozen=True)
 class RingOfBlocks:
-    """A ring of equal blocks.
-
-    Attributes
-    ----------
-    radius_m : float
-        Of the blocks' middles.
-    size_m : float
-        Thickness of the blocks along the radius.
-    blocks : int
-    """
+    """A ring of equal blocks."""
 
     radius_m: float
+    """Of the blocks' middles."""
     size_m: float
+    """Thickness of the blocks along the radius."""
     blocks: int
 
     def table(self, array: Array, z: float) -> Ring:
@@ -61,24 +54,16 @@ Option = tuple[RingOfBlocks | None, ...]
 
 @dataclass(frozen=True)
 class Sample:
-    """Points of a region at which the fields of designs are compared.
-
-    Attributes
-    ----------
-    points : ndarray, shape (k, 3), in m
-        Of points at which all rings have the same field by symmetry, one.
-    weights : ndarray, shape (k,)
-        In means over the volume.
-    surface : ndarray of bool, shape (k,)
-        Which of them are on the surface, where a harmonic function has its extremes.
-    direction : ndarray, shape (3,)
-        Direction of the main field.
-    """
+    """Points of a region at which the fields of designs are compared."""
 
     points: Floats
+    """Of points at which all rings have the same field by symmetry, one. Shape (k, 3), in m."""
     weights: Floats
+    """In means over the volume. Shape (k,)."""
     surface: Bools
+    """Which of them are on the surface, where a harmonic function has its extremes. Shape (k,)."""
     direction: Floats
+    """Direction of the main field. Shape (3,)."""
 
     @classmethod
     def of(cls, region: Region, fields: Callable[[Floats], Floats]) -> Sample:
@@ -99,27 +84,19 @@ class Sample:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a search may choose, with its field in vacuum at the points that decide.
-
-    Attributes
-    ----------
-    study : Study
-    z_m : ndarray, shape (p,)
-        Places of rings from the middle upwards; each but that at 0 stands for that at -z too.
-    options : tuple of Option
-    sample : Sample
-    field_T : ndarray, shape (p, o, k)
-        Component of B along the main field of each option in each place, and in its mirror image.
-    mass_kg : ndarray, shape (p, o)
-    density_kg_per_m3 : float
-    """
+    """What a search may choose, with its field in vacuum at the points that decide."""
 
     study: Study
     z_m: Floats
+    """Places of rings from the middle upwards; each but that at 0 stands for that at -z too.
+    Shape (p,)."""
     options: tuple[Option, ...]
     sample: Sample
     field_T: Floats
+    """Component of B along the main field of each option in each place, and in its mirror image.
+    Shape (p, o, k)."""
     mass_kg: Floats
+    """Shape (p, o)."""
     density_kg_per_m3: float
 
     @classmethod

@@ -43,28 +43,18 @@ from halbach_fe.study.model import Study
 
 @dataclass(frozen=True)
 class RingDesign:
-    """Rings along z, and their field in the region.
-
-    Attributes
-    ----------
-    z_m : ndarray, shape (p,)
-        Places from the middle upwards; those at -z hold equal rings.
-    rings : tuple of Option
-        The ring of each layer in each place, None where it is empty.
-    mean_T : float
-        Mean of |B| over the region's volume.
-    rms_ppm, peak_to_peak_ppm : float
-        Deviations of |B| from it, over the volume and between its extremes, as those of
-        `halbach_fe.response.homogeneity`.
-    mass_kg : float
-    blocks : int
-    """
+    """Rings along z, and their field in the region."""
 
     z_m: Floats
+    """Places from the middle upwards; those at -z hold equal rings. Shape (p,)."""
     rings: tuple[Option, ...]
+    """The ring of each layer in each place, None where it is empty."""
     mean_T: float
+    """Mean of |B| over the region's volume."""
     rms_ppm: float
     peak_to_peak_ppm: float
+    """Deviations of |B| from it, over the volume and between its extremes, as those of
+    `halbach_fe.response.homogeneity`."""
     mass_kg: float
     blocks: int
 

@@ -54,29 +54,20 @@ TINY_T = 1e-12
 
 @dataclass(frozen=True)
 class Task:
-    """Designs, and what is asked of them.
-
-    Attributes
-    ----------
-    table : ndarray, shape (p, o, n + 2)
-        Of option o in place p: the component of B along the main field in T at the points that
-        decide, its mean over the volume in T, and the mass in kg.
-    offset : ndarray, shape (n + 2,)
-        The same of what every design has besides.
-    weights : ndarray, shape (n,)
-        Of the points in means over the volume.
-    objective : str
-        ``peak_to_peak`` or ``rms``.
-    least_field_T, most_mass_kg : float
-        0 and inf where they do not matter.
-    """
+    """Designs, and what is asked of them."""
 
     table: Floats
+    """Of option o in place p: the component of B along the main field in T at the points that
+    decide, its mean over the volume in T, and the mass in kg. Shape (p, o, n + 2)."""
     offset: Floats
+    """The same of what every design has besides. Shape (n + 2,)."""
     weights: Floats
+    """Of the points in means over the volume. Shape (n,)."""
     objective: Literal["peak_to_peak", "rms"]
+    """``peak_to_peak`` or ``rms``."""
     least_field_T: float
     most_mass_kg: float
+    """0 and inf where they do not matter."""
 
     def value(self, total: Floats) -> Floats:
         """Return the deviations (...) in ppm of designs (..., n + 2), and more if they miss."""
@@ -97,18 +88,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Found:
-    """A design that a search has found.
-
-    Attributes
-    ----------
-    chosen : ndarray, shape (p,)
-        Number of the option in each place.
-    ppm : float
-        Its deviation, or more than `MISSES`.
-    """
+    """A design that a search has found."""
 
     chosen: Ints
+    """Number of the option in each place. Shape (p,)."""
     ppm: float
+    """Its deviation, or more than `MISSES`."""
 
 
 def search(
@@ -235,8 +220,6 @@ def moved_radii(
 
     Parameters
     ----------
-    catalogue : Catalogue
-    rings : tuple of Option
     reaction : ndarray, shape (k,), in T
         Field of permeable blocks, which stays as it is.
     task : Task

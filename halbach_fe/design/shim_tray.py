@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, unit_circle
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, slices, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -53,25 +53,16 @@ EMPTY = -1
 
 @dataclass(frozen=True)
 class Filled:
-    """A magnet in a place of a tray.
-
-    Attributes
-    ----------
-    place : int
-        Number of the place, counted from 1.
-    position_m : tuple of float
-    magnet : ShimMagnet
-    from_radius_deg : float
-        Angle of the polarization from the radius of the place.
-    direction_deg : float
-        Angle of the polarization from the x axis of the magnet.
-    """
+    """A magnet in a place of a tray."""
 
     place: int
+    """Number of the place, counted from 1."""
     position_m: tuple[float, float, float]
     magnet: ShimMagnet
     from_radius_deg: float
+    """Angle of the polarization from the radius of the place."""
     direction_deg: float
+    """Angle of the polarization from the x axis of the magnet."""
 
 
 @dataclass(frozen=True)
@@ -238,22 +229,17 @@ def _columns(name: str, values: Floats) -> dict[str, Sequence[object]]:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What each place can hold: a kind of magnet at an angle.
-
-    Attributes
-    ----------
-    tray : ShimTray
-    places : ndarray, shape (p, 3), in m
-    azimuth : ndarray, shape (p,), in rad
-    kind, angle : ndarray, shape (o,)
-        Number of the magnet and angle in degrees from the radius of each choice for a place.
-    """
+    """What each place can hold: a kind of magnet at an angle."""
 
     tray: ShimTray
     places: Floats
+    """Shape (p, 3), in m."""
     azimuth: Floats
+    """Shape (p,), in rad."""
     kind: Ints
     angle: Floats
+    """Number of the magnet and angle in degrees from the radius of each choice for a place.
+    Shape (o,)."""
 
     @classmethod
     def of(cls, tray: ShimTray, study: str) -> _Choices:
@@ -415,8 +401,8 @@ def _best(
     points = model.points[:len(inner)][inner]
     at_once = 1000  # points whose fields are in memory with all components
     effect = whitened(np.concatenate([
-        choices.all_fields(points[first:first + at_once]) @ before.direction
-        for first in range(0, len(points), at_once)], axis=-1))
+        choices.all_fields(points[part]) @ before.direction
+        for part in slices(len(points), at_once)], axis=-1))
     flat = effect.reshape(-1, effect.shape[-1])
     # an error that all shims share adds the square of their whole field
     search = _Search((1 + tray.common_sd**2) * (flat @ flat.T), flat @ target,

@@ -62,22 +62,15 @@ STOPS = {"target": "the limit is met", "uncertainty": "further moves would gain 
 
 @dataclass(frozen=True)
 class Placement:
-    """A block put into a slot.
-
-    Attributes
-    ----------
-    to : int
-        The new slot, counted from 0, ring by ring.
-    block : int
-        The slot that the block was in, or, for spare blocks, the number of slots plus the number of
-        the spare block.
-    turn : int
-        Number of the block's rotation in `Mounts.turns`.
-    """
+    """A block put into a slot."""
 
     to: int
+    """The new slot, counted from 0, ring by ring."""
     block: int
+    """The slot that the block was in, or, for spare blocks, the number of slots plus the number of
+    the spare block."""
     turn: int
+    """Number of the block's rotation in `Mounts.turns`."""
 
 
 @dataclass(frozen=True)
@@ -198,30 +191,21 @@ class Shim(ShownInNotebook):
 
 @dataclass(frozen=True)
 class SpareBlocks:
-    """Spare blocks that may replace others, with independent uncertainties.
-
-    Attributes
-    ----------
-    names : tuple of str
-    mean : ndarray, shape (n, 3), in A/m
-        Means of the magnetizations in own axes (see `halbach_fe.design.remounting`).
-    covariance : ndarray, shape (n, 3, 3), in A^2/m^2
-        Covariances of the magnetizations in own axes.
-    direction : ndarray, shape (n, 3)
-        Directions of the nominal magnetizations in own axes.
-    kind : ndarray of int, shape (n,)
-        Kinds of the blocks as in `Mounts.kinds`.
-    slot : ndarray of int, shape (n,)
-        The only slot, counted from 0, that a block may go into; -1 for blocks without such a
-        restriction.
-    """
+    """Spare blocks that may replace others, with independent uncertainties."""
 
     names: tuple[str, ...]
     mean: Floats
+    """Means of the magnetizations in own axes (see `halbach_fe.design.remounting`).
+    Shape (n, 3), in A/m."""
     covariance: Floats
+    """Covariances of the magnetizations in own axes. Shape (n, 3, 3), in A^2/m^2."""
     direction: Floats
+    """Directions of the nominal magnetizations in own axes. Shape (n, 3)."""
     kind: Ints
+    """Kinds of the blocks as in `Mounts.kinds`. Shape (n,)."""
     slot: Ints
+    """The only slot, counted from 0, that a block may go into; -1 for blocks without such a
+    restriction. Shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -246,34 +230,25 @@ class _MoveModel:
     """Distribution of the blocks in their slots and taken out, from which moves are evaluated.
 
     S is the number of slots, B that of blocks including the spare ones, D the dimension.
-
-    Attributes
-    ----------
-    model : Objective
-    mounts : Mounts
-    mean : ndarray, shape (S, D), in A/m
-        Posterior mean of the mounted blocks, along the axes of the magnet.
-    placed : ndarray, shape (S, D, q), in A/m
-        Covariance factor of the mounted blocks, along the axes of the magnet.
-    loose_mean : ndarray, shape (B, D), in A/m
-        Mean of the blocks once they are taken out, in own axes.
-    loose : ndarray, shape (B, D, q), in A/m
-        Covariance factor of the same, with the same q columns as ``placed``.
-    own : ndarray, shape (B, D, D), in A/m
-        Covariance factor of the independent error of each block when it is mounted again, in own
-        axes; for spare blocks it includes their own uncertainty.
-    fits : ndarray of bool, shape (turns, S, B)
-        Which blocks fit which slots by which turns.
     """
 
     model: Objective
     mounts: Mounts
     mean: Floats
+    """Posterior mean of the mounted blocks, along the axes of the magnet. Shape (S, D), in A/m."""
     placed: Floats
+    """Covariance factor of the mounted blocks, along the axes of the magnet.
+    Shape (S, D, q), in A/m."""
     loose_mean: Floats
+    """Mean of the blocks once they are taken out, in own axes. Shape (B, D), in A/m."""
     loose: Floats
+    """Covariance factor of the same, with the same q columns as ``placed``.
+    Shape (B, D, q), in A/m."""
     own: Floats
+    """Covariance factor of the independent error of each block when it is mounted again, in own
+    axes; for spare blocks it includes their own uncertainty. Shape (B, D, D), in A/m."""
     fits: Bools
+    """Which blocks fit which slots by which turns. Shape (turns, S, B)."""
 
     @property
     def size(self) -> int:
@@ -449,12 +424,7 @@ def check_stock(
 ) -> None:
     """Refuse a stock whose blocks do not fit the magnet, or stand in it already.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    stock : BlockTable
-    mounted : collection of str, optional
-        Serial numbers of the blocks in the magnet, if they are known.
+    ``mounted``: serial numbers of the blocks in the magnet, if they are known.
 
     Raises
     ------
@@ -599,10 +569,7 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
 def _possible_moves(move_model: _MoveModel) -> dict[Kind, int]:
     """Return the number of possible moves of each kind; of cycles without their turns.
 
-    Raises
-    ------
-    StudyError
-        If there are more than `MOST_NUMBERS` allows.
+    StudyError if there are more than `MOST_NUMBERS` allows.
     """
     slots = len(move_model.mean)
     ways = move_model.fits.sum(axis=0, dtype=float)

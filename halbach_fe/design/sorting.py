@@ -37,6 +37,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
+from halbach_fe.design.tolerance import assembled_prior
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import (
@@ -48,7 +49,6 @@ from halbach_fe.inference.block_prior import (
     with_types,
 )
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.response.multipoles import MultipoleModel
 from halbach_fe.stats.gaussian import Gaussian
@@ -138,21 +138,15 @@ class SortedBlocks(ShownInNotebook):
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The measured blocks, and what each of them does in each slot.
-
-    Attributes
-    ----------
-    slots : Slots
-    offset : ndarray, shape (q,)
-        The values without blocks.
-    types, slot_types : ndarray of int, shape (blocks,) and (slots,)
-        Number of the type of each block, and of the blocks that each slot takes.
-    """
+    """The measured blocks, and what each of them does in each slot."""
 
     slots: Slots
     offset: Floats
+    """The values without blocks. Shape (q,)."""
     types: Ints
     slot_types: Ints
+    """Number of the type of each block, and of the blocks that each slot takes.
+    Shape (blocks,) and (slots,)."""
 
 
 def sort_blocks(
@@ -164,12 +158,10 @@ def sort_blocks(
 
     Parameters
     ----------
-    magnet : Magnet
     table : BlockTable
         The measured blocks.
     model : MultipoleModel or DeviationModel
         What to make small.
-    generator : numpy.random.Generator
     progress : callable, optional
         Is called with the number of starts done and their total number.
     turns : bool
@@ -296,12 +288,11 @@ def _blocks(
 
 
 def _assembled(magnet: Magnet, placed: BlockTable, model: Objective) -> Gaussian:
-    """Return the distribution of the magnetizations, and variations inside, of an assembled magnet.
+    """Return the distribution of all parameters of an assembled magnet.
 
     It has the uncertainty of the measured moments, of the coil's calibration and of the mounting.
     """
-    known = prior_from_blocks(magnet, placed).gaussian
-    return with_variations(known, len(model.nominal) - len(known.mean))
+    return assembled_prior(magnet, model.nominal, prior_from_blocks(magnet, placed).gaussian)
 
 
 def present(magnet: Magnet) -> Ints:
@@ -383,30 +374,22 @@ Change = tuple[float, tuple[tuple[int, int, int], ...]]
 
 @dataclass(frozen=True)
 class Slots:
-    """Slots, and the blocks that may stand in them; S slots, B blocks, q values, dimension D.
-
-    Attributes
-    ----------
-    effect : ndarray, shape (q, S, D)
-        Change of the values by magnetizations in A/m in the own axes of each slot.
-    blocks : ndarray, shape (B, D), in A/m
-        Mean magnetizations of the blocks in own axes.
-    spread : ndarray, shape (B, D, D), in A^2/m^2
-        Covariances that mounting adds, in own axes.
-    turns : ndarray, shape (n, D, D)
-        Rotations of a block in its own axes; the first is the identity.
-    fits : ndarray of bool, shape (n, A, C)
-        Turns by which blocks of a class C fit into slots of a class A.
-    slot_class, block_class : ndarray of int, shape (S,) and (B,)
-    """
+    """Slots, and the blocks that may stand in them; S slots, B blocks, q values, dimension D."""
 
     effect: Floats
+    """Change of the values by magnetizations in A/m in the own axes of each slot.
+    Shape (q, S, D)."""
     blocks: Floats
+    """Mean magnetizations of the blocks in own axes. Shape (B, D), in A/m."""
     spread: Floats
+    """Covariances that mounting adds, in own axes. Shape (B, D, D), in A^2/m^2."""
     turns: Floats
+    """Rotations of a block in its own axes; the first is the identity. Shape (n, D, D)."""
     fits: Bools
+    """Turns by which blocks of a class C fit into slots of a class A. Shape (n, A, C)."""
     slot_class: Ints
     block_class: Ints
+    """Shape (S,) and (B,)."""
 
     @cached_property
     def products(self) -> Floats:
@@ -505,22 +488,16 @@ class Slots:
 
 @dataclass
 class Assignment:
-    """Which block stands in which slot by which turn, and the values that result.
-
-    Attributes
-    ----------
-    slots : Slots
-    order, turn : ndarray of int, shape (S,)
-    present : ndarray, shape (S, D), in A/m
-        Magnetizations in the slots, in own axes.
-    values : ndarray, shape (q,)
-    """
+    """Which block stands in which slot by which turn, and the values that result."""
 
     slots: Slots
     order: Ints
     turn: Ints
+    """Shape (S,)."""
     present: Floats
+    """Magnetizations in the slots, in own axes. Shape (S, D), in A/m."""
     values: Floats
+    """Shape (q,)."""
 
     @classmethod
     def of(cls, slots: Slots, order: Ints, start: Floats) -> Assignment:

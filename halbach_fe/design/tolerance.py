@@ -16,7 +16,7 @@ import scipy.linalg as linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.block_variation import with_variations
+from halbach_fe.response.block_variation import with_others
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
 from halbach_fe.stats.gaussian import (
@@ -140,26 +140,32 @@ class HomogeneityTolerance(ShownInNotebook):
         return None if self.share is None else _share_sd(self.share, len(self.rms_ppm))
 
 
-def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
-    """Return the study's prior of the magnetizations of assembled magnets.
+def assembled_prior(
+    magnet: Magnet, nominal: Floats, measured: Gaussian | None = None
+) -> Gaussian:
+    """Return the study's prior of all parameters of assembled magnets.
 
-    It has the tolerances of the blocks, the error that they share, and the random angles by which
-    blocks are turned when they are mounted.
+    It has the tolerances of the blocks, the error that they share, the random angles by which
+    blocks are turned when they are mounted, and what else the study has as uncertain.
 
     Parameters
     ----------
     magnet : Magnet
     nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetizations, and 0 for variations inside blocks.
+        Nominal magnetizations, and 0 for variations inside blocks and uncertain amplitudes.
+    measured : Gaussian, optional
+        Prior of the magnetizations of measured blocks, which replaces the study's.
     """
     settings, size = magnet.study.prior, magnet.dimension
     uniform = nominal[:size * len(magnet.blocks)]
+    if measured is not None:
+        return with_others(measured, magnet, len(nominal) - len(uniform))
     blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
                            settings.common_mode_sd)
     turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return with_variations(
+    return with_others(
         Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),
-        len(nominal) - len(uniform))
+        magnet, len(nominal) - len(uniform))
 
 
 def predict_tolerance(
@@ -174,7 +180,6 @@ def predict_tolerance(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of every |c_n|, in units of 1e-4.
     """
@@ -203,7 +208,6 @@ def predict_homogeneity(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of the rms deviation in ppm.
     """

@@ -35,43 +35,27 @@ from halbach_fe.diagnosis.model_selection import (
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A family in an explanation.
-
-    Attributes
-    ----------
-    family : Family
-    fitted : Fitted
-    columns : ndarray of int, shape (k,)
-        Numbers of its terms among those of all families.
-    deviations : ndarray, shape (k,)
-        Standard deviations of the amplitudes of these terms.
-    """
+    """A family in an explanation."""
 
     family: Family
     fitted: Fitted
     columns: Ints
+    """Numbers of its terms among those of all families. Shape (k,)."""
     deviations: Floats
+    """Standard deviations of the amplitudes of these terms. Shape (k,)."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Effects and terms of any shape that explain the readings together.
-
-    Attributes
-    ----------
-    effects : tuple of int
-        Numbers of the candidates.
-    terms : tuple of Term
-    log_odds : float
-        Log posterior odds over that nothing is missing.
-    chi2 : float
-        Chi-squared per training reading that remains.
-    """
+    """Effects and terms of any shape that explain the readings together."""
 
     effects: tuple[int, ...]
+    """Numbers of the candidates."""
     terms: tuple[Term, ...]
     log_odds: float
+    """Log posterior odds over that nothing is missing."""
     chi2: float
+    """Chi-squared per training reading that remains."""
 
 
 class Competition:

@@ -40,24 +40,16 @@ nothing takes one."""
 
 @dataclass(frozen=True)
 class DiagnosisEstimate:
-    """The cost of a diagnosis.
-
-    Attributes
-    ----------
-    update : Estimate
-        Cost of the inference that every round computes.
-    signatures : int
-        Number of hypotheses whose signatures are computed in the first round.
-    fields : int
-        Number of fields of whole magnets that these signatures need, with iron for example.
-    fields_s : float
-        Time in s of these fields.
-    """
+    """The cost of a diagnosis."""
 
     update: Estimate
+    """Cost of the inference that every round computes."""
     signatures: int
+    """Number of hypotheses whose signatures are computed in the first round."""
     fields: int
+    """Number of fields of whole magnets that these signatures need, with iron for example."""
     fields_s: float
+    """Time in s of these fields."""
 
     @property
     def shortest_s(self) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, slices
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, each_block
 from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
@@ -34,7 +34,6 @@ def detection_limits(
     ----------
     update : InferenceResult
         The inference with the identified effects in the model.
-    campaign : Campaign
     columns : ndarray, shape (rows, k)
         Whitened signatures of the identified effects per prior standard deviation, whose amplitudes
         are free.
@@ -56,9 +55,9 @@ def detection_limits(
     def limits(effect: Effect, count: int) -> Floats:
         """Return the limits (places,) of an effect by its first ``count`` parameters."""
         sd, found = effect.parameters[0].sd, []
-        for first in range(0, len(places), blocks_at_once):
+        for part in slices(len(places), blocks_at_once):
             signatures = [sd * training.shown(scene.signature(Hypothesis(effect, place))[:count])
-                for place in places[first:first + blocks_at_once]]
+                          for place in places[part]]
             evidence = training.marginal.evidence(np.hstack([columns, *signatures]),
                                          np.zeros(len(columns))).given(range(columns.shape[1]))
             for number in range(len(signatures)):
@@ -76,12 +75,8 @@ def detection_limits(
 def smallest_amplitude(information: Floats, threshold: float) -> float:
     """Return the amplitude at which the log Bayes factor of an effect passes a threshold.
 
-    Parameters
-    ----------
-    information : ndarray, shape (k, k)
-        Of its signatures, per prior standard deviation of their amplitudes. The amplitudes are in
-        the direction in which they are least visible.
-    threshold : float
+    ``information`` (k, k): of its signatures, per prior standard deviation of their amplitudes. The
+    amplitudes are in the direction in which they are least visible.
 
     Returns
     -------

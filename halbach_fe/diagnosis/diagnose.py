@@ -125,27 +125,17 @@ Rivals = dict[Hypothesis, tuple[tuple[Candidate, float], ...]]
 
 @dataclass(frozen=True)
 class _Round:
-    """A round of the search, of whose model the effects in it are known.
-
-    Attributes
-    ----------
-    number : int
-        Counted from 1.
-    update : InferenceResult
-    search : Search
-    judgement : Judgement
-    identified : tuple of IdentifiedEffect
-        The effects in the model.
-    misfit : float
-        Mean square of the held-out residuals, in units of the noise.
-    """
+    """A round of the search, of whose model the effects in it are known."""
 
     number: int
+    """Counted from 1."""
     update: InferenceResult
     search: Search
     judgement: Judgement
     identified: tuple[IdentifiedEffect, ...]
+    """The effects in the model."""
     misfit: float
+    """Mean square of the held-out residuals, in units of the noise."""
 
     @property
     def gives_way(self) -> bool:
@@ -165,7 +155,6 @@ def diagnose(
 
     Parameters
     ----------
-    study : Study
     data : Dataset or dict of str to Dataset
         The map, as `halbach_fe.measurement.field_map.read_map` returns it; or all maps that the
         study lists, see `halbach_fe.measurement.campaign.read_maps`.
@@ -579,7 +568,6 @@ def with_first_rivals(
 
     Parameters
     ----------
-    found : sequence of IdentifiedEffect
     identified : sequence of IdentifiedEffect
         The effects in the model.
     rivals : dict

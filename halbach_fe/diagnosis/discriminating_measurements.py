@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 
-from halbach_fe.core.arrays import Bools, Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, radii_of, spread
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -40,12 +40,12 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.measurement.scan_lines import motion
-from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.response.block_variation import Deviations, vacuum_changes
+from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.inference import PROBE_KEYS
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -67,81 +67,54 @@ TEMPERATURE_EFFECTS = {"temperature", "temperature_gradient"}
 
 @dataclass(frozen=True)
 class ProposedScan:
-    """Readings of a map, present or proposed.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), in m
-        Points in the mapper's axes.
-    time : ndarray, shape (n,)
-        Time of each point, from 0 to 1.
-    analysis : sparse array, shape (readings, 3 n)
-        Matrix from B at the points to the readings.
-    noise : NoiseCovariance
-        Noise of the readings.
-    probe_rotation, magnet_rotation : ndarray, shape (3, 3)
-        Rotations of the probe and of the magnet in the mapper's axes, relative to their orientation
-        in the study.
-    temperature_known : bool
-        Whether the magnet's temperature is uniform and measured.
-    mapped : bool
-        Whether the mapper and its probe take the readings; False for an NMR teslameter.
-    map : str or None
-        Name of the map, of those that the study lists, whose mapper and probe take them.
-    way : ndarray, shape (n, 3), or None
-        See `NominalFields.way`; None if all lines go one way, so that a lag does not show.
-    """
+    """Readings of a map, present or proposed."""
 
     points: Floats
+    """Points in the mapper's axes. Shape (n, 3), in m."""
     time: Floats
+    """Time of each point, from 0 to 1. Shape (n,)."""
     analysis: sparse.csr_array
+    """Matrix from B at the points to the readings. Shape (readings, 3 n)."""
     noise: NoiseCovariance
+    """Noise of the readings."""
     probe_rotation: Floats
     magnet_rotation: Floats
+    """Rotations of the probe and of the magnet in the mapper's axes, relative to their orientation
+    in the study. Shape (3, 3)."""
     temperature_known: bool = False
+    """Whether the magnet's temperature is uniform and measured."""
     mapped: bool = True
+    """Whether the mapper and its probe take the readings; False for an NMR teslameter."""
     map: str | None = None
+    """Name of the map, of those that the study lists, whose mapper and probe take them."""
     way: Floats | None = None
+    """See `NominalFields.way`; None if all lines go one way, so that a lag does not show.
+    Shape (n, 3)."""
 
 
 @dataclass(frozen=True)
 class CandidateMeasurement:
-    """A further measurement that can be made.
-
-    Attributes
-    ----------
-    name : str
-    title : str
-        Description for a report.
-    scan : ProposedScan
-        The readings that the measurement adds.
-    """
+    """A further measurement that can be made."""
 
     name: str
     title: str
+    """Description for a report."""
     scan: ProposedScan
+    """The readings that the measurement adds."""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """The measurements that can distinguish an identified effect from a rival.
-
-    Attributes
-    ----------
-    identified, rival : Hypothesis
-    candidates : tuple of CandidateMeasurement
-        All candidate measurements, the cheapest first.
-    gains : dict
-        Expected gain in the log Bayes factor by name of the candidate.
-    recommended : CandidateMeasurement or None
-        The cheapest candidate whose gain exceeds `SEPARATING_GAIN`.
-    """
+    """The measurements that can distinguish an identified effect from a rival."""
 
     identified: Hypothesis
     rival: Hypothesis
     candidates: tuple[CandidateMeasurement, ...]
+    """All candidate measurements, the cheapest first."""
     gains: dict[str, float]
+    """Expected gain in the log Bayes factor by name of the candidate."""
     recommended: CandidateMeasurement | None
+    """The cheapest candidate whose gain exceeds `SEPARATING_GAIN`."""
 
 
 @dataclass(frozen=True)
@@ -150,20 +123,15 @@ class ScanFields(NominalFields):
 
     The magnet is rotated before the mapper. Effects of the instrument take their signatures from
     these fields.
-
-    Attributes
-    ----------
-    unrotated : NominalFields
-        The study's magnet at the points of all scans, in the magnet's own axes.
-    part : slice
-        The points of this scan among all points of ``unrotated``.
-    magnet_rotation, probe_rotation : ndarray, shape (3, 3)
     """
 
     unrotated: NominalFields
+    """The study's magnet at the points of all scans, in the magnet's own axes."""
     part: slice
+    """The points of this scan among all points of ``unrotated``."""
     magnet_rotation: Floats
     probe_rotation: Floats
+    """Shape (3, 3)."""
 
     @cached_property
     def field(self) -> Floats:
@@ -189,10 +157,8 @@ def separations(
 
     Parameters
     ----------
-    diagnosis : Diagnosis
     data : Dataset or dict of str to Dataset
         The maps that were diagnosed.
-    session : Session
     effects : sequence of Effect, optional
         The effects among which the diagnosis chose; default the whole catalogue.
     """
@@ -274,8 +240,7 @@ def candidate_measurements(
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
-    heights = np.unique(np.round(places[:, 2], 9))
-    heights = heights[np.linspace(0, len(heights) - 1, min(len(heights), 40)).astype(int)]
+    heights = spread(np.unique(np.round(places[:, 2], 9)), 40)
     others = [("second_radius", f"circles of radius {1e3 * radius:.0f} mm",
                np.vstack([_circle(radius, z) for z in heights]))]
     if study.dimension == 3:
@@ -354,13 +319,23 @@ class _NominalMagnet:
 
     @cached_property
     def response(self) -> Floats:
-        """B (parameters, n, 3) in T for a magnetization of 1 A/m of each block along each axis."""
-        size = self.nominal.study.dimension
-        return np.concatenate([
-            np.moveaxis(unit @ (MU_0 * block.recoil_tensor[:, :size]), 2, 0)
-            for block, unit in zip(
-                self.nominal.blocks, unit_fields(self.nominal.blocks, self.nominal.points),
-                strict=True)])
+        """B (parameters, n, 3) in T per unit of all parameters of the magnet, in its axes."""
+        columns = Deviations.of(self.nominal.magnet).columns(self.nominal.points)
+        return np.moveaxis(columns.reshape(*self.nominal.points.shape, -1), 2, 0)
+
+    def seen(self, scan: ProposedScan, part: slice) -> Floats:
+        """Return `response` (parameters, k, 3) at the points of a scan, in the mapper's axes.
+
+        What is outside of the magnet does not turn with it.
+        """
+        found = self.response[:, part] @ scan.magnet_rotation.T
+        amplitudes = self.nominal.study.uncertain_of_magnet
+        outside = np.flatnonzero([all(name.startswith("external.") for name in one.change)
+                                  for one in amplitudes])
+        if len(outside):
+            found[len(found) - len(amplitudes) + outside] = vacuum_changes(
+                self.nominal.magnet, scan.points)[outside]
+        return found
 
     def signature(self, hypothesis: Hypothesis) -> Floats:
         """Return the signature (k, n, 3) in T of an effect of the magnet, in the magnet's axes."""
@@ -408,8 +383,8 @@ class _Readings:
             nominal, part, scan.magnet_rotation, np.eye(3),
             way=np.zeros_like(scan.points) if scan.way is None else scan.way)
         self.sensors = replace(self.mapper, probe_rotation=scan.probe_rotation)
-        self.blocks = np.hstack([self._whitened(
-            magnet.response[:, part] @ scan.magnet_rotation.T) @ diagnosis.before.prior.root,
+        self.blocks = np.hstack([
+            self._whitened(magnet.seen(scan, part)) @ diagnosis.before.prior.root,
             self._open_terms(diagnosis.before.terms)])
 
     def _open_terms(self, terms: InstrumentTerms | None) -> Floats:

@@ -39,18 +39,12 @@ in z."""
 
 @dataclass(frozen=True)
 class SmoothTerms:
-    """The terms of a smooth discrepancy.
-
-    Attributes
-    ----------
-    fields : ndarray, shape (k, n, 3)
-        Normalized fields at the points of a map.
-    fineness : ndarray, shape (k, 2)
-        Azimuthal order and number of half waves in z of each term.
-    """
+    """The terms of a smooth discrepancy."""
 
     fields: Floats
+    """Normalized fields at the points of a map. Shape (k, n, 3)."""
     fineness: Floats
+    """Azimuthal order and number of half waves in z of each term. Shape (k, 2)."""
 
 
 def harmonic_fields(
@@ -163,47 +157,33 @@ AXES = ((0,), (1,), (2,), (0, 1, 2))
 
 @dataclass(frozen=True)
 class Family:
-    """Causes of one kind.
-
-    Attributes
-    ----------
-    acts_on : str
-        ``field``, ``readings``, ``gains`` or ``positions``.
-    along : str
-        Coordinate on which the functions depend; empty for fields.
-    fields : callable
-        Returns changes (k, n, 3) in T of the map's values by the terms, each with an rms of about
-        one reading's noise. They are large, and are computed whenever they are asked for.
-    axis : ndarray of int, shape (k,)
-        Component on which each term acts; -1 for terms that act on all.
-    spectra : ndarray, shape (spectra, k)
-        Relative standard deviations of the amplitudes, from smooth to rough.
-    smooth : tuple of bool
-        Whether the functions of each spectrum are smooth.
-    waves : ndarray, shape (k,)
-        Half waves of each term over the range of the coordinate (over 360 degrees of azimuth).
-    span : float
-        Range of the coordinate, in m, degrees, T or as a fraction of the map's time.
-    unit : float
-        Error of the readings in T, of the gains, or of the positions in m, by a term of amplitude
-        1; 0 for fields, whose size is that of `fields`.
-    map : str or None
-        Name of the map on whose instrument it acts, of several; None if it acts on all.
-    rows : slice
-        Of the points on which it acts, among those of all maps.
-    """
+    """Causes of one kind."""
 
     acts_on: ActsOn
+    """``field``, ``readings``, ``gains`` or ``positions``."""
     along: str
+    """Coordinate on which the functions depend; empty for fields."""
     fields: Callable[[], Floats] = field(repr=False)
+    """Returns changes (k, n, 3) in T of the map's values by the terms, each with an rms of about
+    one reading's noise. They are large, and are computed whenever they are asked for."""
     axis: np.ndarray[tuple[int], np.dtype[np.int_]] = field(repr=False)
+    """Component on which each term acts; -1 for terms that act on all. Shape (k,)."""
     spectra: Floats = field(repr=False)
+    """Relative standard deviations of the amplitudes, from smooth to rough. Shape (spectra, k)."""
     smooth: tuple[bool, ...] = field(repr=False)
+    """Whether the functions of each spectrum are smooth."""
     waves: Floats = field(repr=False)
+    """Half waves of each term over the range of the coordinate (over 360 degrees of azimuth).
+    Shape (k,)."""
     span: float = 0.0
+    """Range of the coordinate, in m, degrees, T or as a fraction of the map's time."""
     unit: float = 0.0
+    """Error of the readings in T, of the gains, or of the positions in m, by a term of amplitude 1;
+    0 for fields, whose size is that of `fields`."""
     map: str | None = None
+    """Name of the map on whose instrument it acts, of several; None if it acts on all."""
     rows: slice = field(default_factory=lambda: slice(None))
+    """Of the points on which it acts, among those of all maps."""
 
     @property
     def name(self) -> str:
@@ -223,29 +203,20 @@ class Family:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A family at its likeliest components, spectrum and size.
-
-    Attributes
-    ----------
-    log_bayes_factor : float
-        Log Bayes factor over no such cause, averaged over components, spectra and sizes.
-    at_best : float
-        The same at the likeliest ones, without the average.
-    axes : tuple of int
-        Components on which it acts; empty for a field.
-    smooth : bool
-    deviations : ndarray, shape (k,)
-        Standard deviations of the amplitudes of all terms; 0 for terms that are left out.
-    mean : ndarray, shape (k,)
-        Posterior mean of the amplitudes.
-    """
+    """A family at its likeliest components, spectrum and size."""
 
     log_bayes_factor: float
+    """Log Bayes factor over no such cause, averaged over components, spectra and sizes."""
     at_best: float
+    """The same at the likeliest ones, without the average."""
     axes: tuple[int, ...]
+    """Components on which it acts; empty for a field."""
     smooth: bool
     deviations: Floats
+    """Standard deviations of the amplitudes of all terms; 0 for terms that are left out.
+    Shape (k,)."""
     mean: Floats
+    """Posterior mean of the amplitudes. Shape (k,)."""
 
 
 def fit_family(family: Family, evidence: Evidence) -> Fitted:

@@ -80,28 +80,19 @@ starts."""
 
 @dataclass(frozen=True)
 class GrossError:
-    """A gross error of a map, or several that occur together.
-
-    Attributes
-    ----------
-    convention : MapConvention
-        The convention by which the map is to be read.
-    alternatives : tuple of MapConvention
-        Other conventions that explain the map equally well.
-    misfit_before, misfit_after : float
-        Rms difference from the nominal magnet, relative to the map's rms.
-    map : str or None
-        Name of the map among those that the study lists; None if it lists none.
-    factor : float or None
-        Factor of all readings that explains the map as well, if there is one.
-    """
+    """A gross error of a map, or several that occur together."""
 
     convention: MapConvention
+    """The convention by which the map is to be read."""
     alternatives: tuple[MapConvention, ...]
+    """Other conventions that explain the map equally well."""
     misfit_before: float
     misfit_after: float
+    """Rms difference from the nominal magnet, relative to the map's rms."""
     map: str | None = None
+    """Name of the map among those that the study lists; None if it lists none."""
     factor: float | None = None
+    """Factor of all readings that explains the map as well, if there is one."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,21 +128,14 @@ class GrossError:
 
 @dataclass(frozen=True)
 class _Misfit:
-    """Rms difference between a map and a magnet.
-
-    Attributes
-    ----------
-    standard : float
-        Relative to what tolerances of blocks and usual effects cause.
-    relative : float
-        Relative to the map's rms.
-    factor : float
-        Common factor of the readings.
-    """
+    """Rms difference between a map and a magnet."""
 
     standard: float
+    """Relative to what tolerances of blocks and usual effects cause."""
     relative: float
+    """Relative to the map's rms."""
     factor: float = 1.0
+    """Common factor of the readings."""
 
 
 NOT_COMPARED = np.zeros(0), _Misfit(np.inf, np.inf)
@@ -165,7 +149,6 @@ def find_gross_errors(
 
     Parameters
     ----------
-    study : Study
     data : Dataset
         The map, as `halbach_fe.measurement.field_map.read_map` returns it.
     blocks : BlockTable, optional
@@ -637,24 +620,16 @@ class _Search:
 
 @dataclass(frozen=True)
 class _Nominal:
-    """The field of the nominal magnet in the axes of the sensors.
-
-    Attributes
-    ----------
-    blocks : ndarray, shape (n, 3), in T
-        Field of the nominal blocks in vacuum.
-    across : ndarray, shape (n, 3), in T
-        The same with the magnetization of all blocks turned by 90 deg.
-    external : ndarray, shape (n, 3), in T
-        Field of external sources and of iron of any shape.
-    variance : ndarray, shape (n, 3), in T^2
-        Variance that the tolerances of the blocks cause.
-    """
+    """The field of the nominal magnet in the axes of the sensors."""
 
     blocks: Floats
+    """Field of the nominal blocks in vacuum. Shape (n, 3), in T."""
     across: Floats
+    """The same with the magnetization of all blocks turned by 90 deg. Shape (n, 3), in T."""
     external: Floats
+    """Field of external sources and of iron of any shape. Shape (n, 3), in T."""
     variance: Floats
+    """Variance that the tolerances of the blocks cause. Shape (n, 3), in T^2."""
 
     @classmethod
     def of(

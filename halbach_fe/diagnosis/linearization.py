@@ -295,7 +295,6 @@ def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -
 
     Parameters
     ----------
-    hypothesis : Hypothesis
     amounts : ndarray, shape (k,)
         Amplitudes of the parameters and refinements.
     scene : Scene

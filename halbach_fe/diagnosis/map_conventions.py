@@ -35,24 +35,16 @@ IDENTITY_AXES: Axes = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class ArrayVariant:
-    """A magnet that may have been measured in place of the study's.
-
-    Attributes
-    ----------
-    name : str
-        Standard name of the error.
-    title : str
-        Description for a report.
-    change : callable
-        From the study to that of the true magnet.
-    turn_rad : float or None
-        Angle by which the magnetization of each block is turned, if this is the only difference.
-    """
+    """A magnet that may have been measured in place of the study's."""
 
     name: str
+    """Standard name of the error."""
     title: str
+    """Description for a report."""
     change: Callable[[Study], Study] = field(compare=False)
+    """From the study to that of the true magnet."""
     turn_rad: float | None = None
+    """Angle by which the magnetization of each block is turned, if this is the only difference."""
 
 
 @dataclass(frozen=True)
@@ -60,35 +52,25 @@ class MapConvention:
     """The convention by which a map is to be read, and the magnet that it shows.
 
     The defaults are those of the study. Each difference from them is a gross error.
-
-    Attributes
-    ----------
-    length_unit, flux_density_unit : float
-        Units of the map in the study's units.
-    positions, fields : tuple of str
-        Axes of the columns, see `halbach_fe.study.measurement.Instrument`.
-    magnet : ArrayVariant or None
-        The magnet that was measured in place of the study's.
-    radius : float
-        Factor of the points' distances from the axis.
-    offset_m : float
-        Offset of the points' distances from the axis.
-    shift_m : tuple of float
-        Displacement of all points.
-    components : tuple of str
-        Components that the map shows and the study does not observe, such as z if it is what a
-        study of y alone calls so.
     """
 
     length_unit: float = 1.0
     flux_density_unit: float = 1.0
+    """Units of the map in the study's units."""
     positions: Axes = IDENTITY_AXES
     fields: Axes = IDENTITY_AXES
+    """Axes of the columns, see `halbach_fe.study.measurement.Instrument`."""
     magnet: ArrayVariant | None = None
+    """The magnet that was measured in place of the study's."""
     radius: float = 1.0
+    """Factor of the points' distances from the axis."""
     offset_m: float = 0.0
+    """Offset of the points' distances from the axis."""
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Displacement of all points."""
     components: tuple[Component, ...] = ()
+    """Components that the map shows and the study does not observe, such as z if it is what a study
+    of y alone calls so."""
 
     @property
     def errors(self) -> tuple[tuple[str, str], ...]:

@@ -62,7 +62,6 @@ def possible_positions(
         The positions.
     updated : callable
         Takes a position and a name, and returns the inference with that position.
-    campaign : Campaign
 
     Returns
     -------
@@ -273,7 +272,6 @@ def find_poses(
         Corrected for gross errors.
     data : Dataset or dict of str to Dataset
         The map, or the maps that the study lists.
-    session : Session
     say : callable
         Called with a description of each step before it starts.
     iron : callable, optional

@@ -23,25 +23,20 @@ import numpy as np
 import scipy.linalg as linalg
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.stats.small_samples import false_discovery_rates
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The posterior of the amplitudes of a set of effects.
-
-    Attributes
-    ----------
-    log_evidence : float
-        Log evidence of the set over that of no effect.
-    mean, covariance : ndarray, shape (k,) and (k, k)
-        Posterior mean and covariance of the amplitudes, in units of their prior standard deviation.
-    """
+    """The posterior of the amplitudes of a set of effects."""
 
     log_evidence: float
+    """Log evidence of the set over that of no effect."""
     mean: Floats
     covariance: Floats
+    """Posterior mean and covariance of the amplitudes, in units of their prior standard deviation.
+    Shape (k,) and (k, k)."""
 
 
 @dataclass(frozen=True)
@@ -51,34 +46,26 @@ class Evidence:
     Conditioning on a few of thousands of columns changes the matrix A by a product of low rank.
     Only its factor is kept, so that it costs as much as the columns and not as their square. The
     matrix A is ``(information - absorbed' absorbed) / temperature``.
-
-    Attributes
-    ----------
-    information : ndarray, shape (k, k)
-        The matrix A of the module's docstring before any columns were integrated out. Use `part`.
-    score : ndarray, shape (k,)
-        The vector b of the module's docstring.
-    chi2 : float
-        The scalar c of the module's docstring. Its expectation is the number of readings if no
-        effect is missing.
-    readings : int
-        Number of readings.
-    prior : ndarray, shape (k,)
-        Prior precisions of the amplitudes, in units of their usual prior standard deviation: 1
-        unless widened.
-    absorbed : ndarray, shape (d, k)
-        Information that columns which were integrated out have taken, one row for each of them.
-    temperature : float
-        Variance of the noise over the stated one.
     """
 
     information: Floats
+    """The matrix A of the module's docstring before any columns were integrated out. Use `part`.
+    Shape (k, k)."""
     score: Floats
+    """The vector b of the module's docstring. Shape (k,)."""
     chi2: float
+    """The scalar c of the module's docstring. Its expectation is the number of readings if no
+    effect is missing."""
     readings: int
+    """Number of readings."""
     prior: Floats
+    """Prior precisions of the amplitudes, in units of their usual prior standard deviation: 1
+    unless widened. Shape (k,)."""
     absorbed: Floats
+    """Information that columns which were integrated out have taken, one row for each of them.
+    Shape (d, k)."""
     temperature: float = 1.0
+    """Variance of the noise over the stated one."""
 
     @classmethod
     def of(cls, information: Floats, score: Floats, chi2: float, readings: int) -> Evidence:
@@ -191,18 +178,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Marginal:
-    """The readings with the blocks integrated out, for products with S^-1.
-
-    Attributes
-    ----------
-    whitened : ndarray, shape (n, m)
-        Sigma^-1/2 H L, with L a factor of C_0.
-    factor : tuple
-        Cholesky factor of 1 + whitened' whitened.
-    """
+    """The readings with the blocks integrated out, for products with S^-1."""
 
     whitened: Floats
+    """Sigma^-1/2 H L, with L a factor of C_0. Shape (n, m)."""
     factor: tuple[Floats, bool]
+    """Cholesky factor of 1 + whitened' whitened."""
 
     @classmethod
     def of(cls, whitened: Floats) -> Marginal:
@@ -263,7 +244,7 @@ def _rows(count: int) -> list[slice]:
     """Return slices of rows, so few that the memory of a product over them is bounded."""
     # Number of rows that products over all readings take at a time, to bound their memory.
     rows_at_once = 8192
-    return [slice(first, first + rows_at_once) for first in range(0, count, rows_at_once)]
+    return slices(count, rows_at_once)
 
 
 DISCOVERIES = 0.01
@@ -272,26 +253,18 @@ DISCOVERIES = 0.01
 
 @dataclass(frozen=True)
 class ResidualGroup:
-    """The residual of a group of readings, such as those in a window of z.
-
-    Attributes
-    ----------
-    kind, name : str
-        Kind and name of the group, for example ``z`` and ``-0.10 ... 0.00 m``.
-    readings : int
-        Number of readings.
-    chi2_per_reading : float
-        Chi-squared per reading; its expectation is 1.
-    p : float
-        Probability of a larger chi-squared by chance, adjusted for the number of groups (Benjamini
-        and Hochberg).
-    """
+    """The residual of a group of readings, such as those in a window of z."""
 
     kind: str
     name: str
+    """Kind and name of the group, for example ``z`` and ``-0.10 ... 0.00 m``."""
     readings: int
+    """Number of readings."""
     chi2_per_reading: float
+    """Chi-squared per reading; its expectation is 1."""
     p: float
+    """Probability of a larger chi-squared by chance, adjusted for the number of groups (Benjamini
+    and Hochberg)."""
 
     @property
     def disagrees(self) -> bool:
@@ -345,7 +318,6 @@ def residual_groups(
 
     Parameters
     ----------
-    marginal : Marginal
     residual : ndarray, shape (n,)
         Whitened residual of the readings.
     memberships : dict

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.arrays import Bools, Floats, slices
 from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 
 DETECTION_LOG_ODDS = 5.0
@@ -53,41 +53,28 @@ outside the catalogue."""
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect at one place.
-
-    Attributes
-    ----------
-    effect : str
-    place : str
-        Name of the block, seam or point; empty for effects that have only one place.
-    columns : tuple of int
-        The candidate's columns of the evidence.
-    is_binary : bool
-        Whether the amplitude of the first column is exactly 1 if the effect is present, as of a
-        missing block.
-    unique : bool
-        Whether the effect can be present at one place at most.
-    places : int or None
-        Number of places of the effect, which share its prior probability; None if all of them are
-        candidates.
-    parts : tuple of tuple of int
-        Amplitudes that may be free together while the others are 0, as positions in ``columns``.
-        It is empty if all are free.
-    shared : tuple of int
-        Amplitudes that do not give the effect its name, as positions in ``columns``.
-    relative_odds : float
-        Prior odds of the effect, relative to others.
-    """
+    """An effect at one place."""
 
     effect: str
     place: str
+    """Name of the block, seam or point; empty for effects that have only one place."""
     columns: tuple[int, ...]
+    """The candidate's columns of the evidence."""
     is_binary: bool = False
+    """Whether the amplitude of the first column is exactly 1 if the effect is present, as of a
+    missing block."""
     unique: bool = False
+    """Whether the effect can be present at one place at most."""
     places: int | None = None
+    """Number of places of the effect, which share its prior probability; None if all of them are
+    candidates."""
     parts: tuple[tuple[int, ...], ...] = ()
+    """Amplitudes that may be free together while the others are 0, as positions in ``columns``. It
+    is empty if all are free."""
     shared: tuple[int, ...] = ()
+    """Amplitudes that do not give the effect its name, as positions in ``columns``."""
     relative_odds: float = 1.0
+    """Prior odds of the effect, relative to others."""
 
     @property
     def free(self) -> tuple[int, ...]:
@@ -107,26 +94,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """A candidate that is missing from the model, and its alternatives.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    log_bayes_factor : float
-        Log Bayes factor of the model with the candidate over that without it. The other selected
-        effects are in both.
-    log_odds : float
-        Log posterior odds: the log Bayes factor plus the log prior odds of the effect at this
-        place.
-    alternatives : tuple of (Candidate, float)
-        Candidates that explain the readings equally well in place of this one, with their log Bayes
-        factors.
-    """
+    """A candidate that is missing from the model, and its alternatives."""
 
     candidate: Candidate
     log_bayes_factor: float
+    """Log Bayes factor of the model with the candidate over that without it. The other selected
+    effects are in both."""
     log_odds: float
+    """Log posterior odds: the log Bayes factor plus the log prior odds of the effect at this
+    place."""
     alternatives: tuple[tuple[Candidate, float], ...]
+    """Candidates that explain the readings equally well in place of this one, with their log Bayes
+    factors."""
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -278,12 +257,8 @@ def select_effects(
 ) -> list[SelectedEffect]:
     """Select missing effects one at a time, and drop those that later ones make needless.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    candidates : sequence of Candidate
-    excluded : collection of int
-        Numbers of candidates that cannot be selected, because their amplitudes are impossible.
+    ``excluded``: numbers of candidates that cannot be selected, because their amplitudes are
+    impossible.
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
@@ -456,22 +431,14 @@ tube the correlations are 0.98 for iron that saturates and 0.96 for the permeabi
 
 @dataclass(frozen=True)
 class Compared:
-    """Candidates that are compared with each other.
-
-    Attributes
-    ----------
-    numbers : tuple of int
-        Of these candidates among all, in order.
-    columns : ndarray, shape (rows, k)
-        Their whitened signatures.
-    absorbed : ndarray, shape (m, k + 1)
-        `Marginal.absorbed` of these and of the residual.
-    evidence : Evidence
-    """
+    """Candidates that are compared with each other."""
 
     numbers: tuple[int, ...]
+    """Of these candidates among all, in order."""
     columns: Floats
+    """Their whitened signatures. Shape (rows, k)."""
     absorbed: Floats
+    """`Marginal.absorbed` of these and of the residual. Shape (m, k + 1)."""
     evidence: Evidence
 
 
@@ -488,10 +455,8 @@ def most_likely(
 
     Parameters
     ----------
-    candidates : sequence of Candidate
     columns : sequence of ndarray, shape (rows, k)
         Whitened signatures of every candidate.
-    marginal : Marginal
     residual : ndarray, shape (rows,)
         Whitened residual to which the signatures are fitted.
     in_model : collection of int
@@ -514,8 +479,7 @@ def most_likely(
         return compared(range(len(candidates)))
     factors = np.empty(len(candidates))
     model = sorted(in_model)
-    for first in range(0, len(candidates), AT_ONCE):
-        some = list(range(first, min(first + AT_ONCE, len(candidates))))
+    for some in (list(range(part.start, part.stop)) for part in slices(len(candidates), AT_ONCE)):
         numbered = renumbered([candidates[number] for number in (*model, *some)])
         beside = with_candidates(compared([*model, *some]).evidence, numbered[:len(model)])
         factors[some] = log_bayes_factors(beside, numbered[len(model):])

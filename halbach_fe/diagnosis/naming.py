@@ -61,23 +61,15 @@ SUSPECTED = 0.5
 
 @dataclass(frozen=True)
 class Judgement:
-    """The outcome of the competition in one round.
-
-    Attributes
-    ----------
-    competition : Competition
-    catalogued : Explanation
-        The effects that the catalogue alone would give.
-    best : Explanation
-        The best explanation, with such effects only as may be named.
-    without : Explanation
-        The best explanation without any effect.
-    """
+    """The outcome of the competition in one round."""
 
     competition: Competition
     catalogued: Explanation
+    """The effects that the catalogue alone would give."""
     best: Explanation
+    """The best explanation, with such effects only as may be named."""
     without: Explanation
+    """The best explanation without any effect."""
 
     @property
     def is_clear(self) -> bool:
@@ -281,16 +273,13 @@ class Further:
 
     The probabilities assume that at most one more thing is missing: an effect of the catalogue, or
     a cause of any shape.
-
-    Attributes
-    ----------
-    odds : ndarray, shape (candidates,)
-        Log posterior odds of every candidate; -inf for those that are in the explanation.
-    probabilities : ndarray, shape (candidates,)
     """
 
     odds: Floats
+    """Log posterior odds of every candidate; -inf for those that are in the explanation.
+    Shape (candidates,)."""
     probabilities: Floats
+    """Shape (candidates,)."""
 
     @classmethod
     def of(cls, judgement: Judgement) -> Further:

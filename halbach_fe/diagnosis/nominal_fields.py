@@ -35,42 +35,32 @@ class NominalFields:
     """The nominal magnet of a study, and its field at the points of a map.
 
     Fields are computed when they are first asked for, and kept.
-
-    Attributes
-    ----------
-    study : Study
-    points : ndarray, shape (n, 3), in m
-        Positions of the probe along the magnet's axes.
-    time : ndarray, shape (n,)
-        When each point was read, from 0 at the first reading of the map to 1 at the last.
-    solve : callable
-        Function of a study that returns the field (n, 3) in T of its nominal magnet at the points,
-        by finite elements.
-    solve_iron : callable, optional
-        Function of a study that returns the change (n, 3) in T that its iron makes to the field of
-        blocks in vacuum, or None if `solve` takes no longer.
-    stated : ndarray, shape (n, 3), in m, or None
-        The points as the map states them; None if they are where the probe was.
-    of_total_field : bool
-        Whether the map is of |B| alone.
-    way : ndarray, shape (n, 3), or None
-        Unit vectors along which the stage came to each point, see
-        `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its
-        order.
-    measured_magnetizations : ndarray, shape (blocks, D), in A/m, or None
-        Magnetizations that are expected from measurements of the single blocks, in D dimensions;
-        None to use the nominal ones.
     """
 
     study: Study
     points: Floats
+    """Positions of the probe along the magnet's axes. Shape (n, 3), in m."""
     time: Floats
+    """When each point was read, from 0 at the first reading of the map to 1 at the last.
+    Shape (n,)."""
     solve: Callable[[Study], Floats]
+    """Function of a study that returns the field (n, 3) in T of its nominal magnet at the points,
+    by finite elements."""
     solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
+    """Function of a study that returns the change (n, 3) in T that its iron makes to the field of
+    blocks in vacuum, or None if `solve` takes no longer."""
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
+    """Magnetizations that are expected from measurements of the single blocks, in D dimensions;
+    None to use the nominal ones. Shape (blocks, D), in A/m."""
     stated: Floats | None = field(default=None, kw_only=True)
+    """The points as the map states them; None if they are where the probe was.
+    Shape (n, 3), in m."""
     of_total_field: bool = field(default=False, kw_only=True)
+    """Whether the map is of |B| alone."""
     way: Floats | None = field(default=None, kw_only=True)
+    """Unit vectors along which the stage came to each point, see
+    `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its order.
+    Shape (n, 3)."""
     _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property

@@ -38,29 +38,20 @@ CROWD_PROBABILITY = 1e-4
 
 @dataclass(frozen=True)
 class Outlier:
-    """A reading that is an outlier.
-
-    Attributes
-    ----------
-    row : int
-        Row of the map, from 1.
-    component : str
-        x, y or z, or `TOTAL` of |B|.
-    at_m : tuple of float
-        Position of the reading according to the map.
-    off_T, sd_T : float
-        Difference from the prediction by all readings that are no outliers, and its standard
-        deviation.
-    map : str or None
-        Name of the map among those that the study lists; None if it lists none.
-    """
+    """A reading that is an outlier."""
 
     row: int
+    """Row of the map, from 1."""
     component: str
+    """x, y or z, or `TOTAL` of |B|."""
     at_m: tuple[float, ...]
+    """Position of the reading according to the map."""
     off_T: float
     sd_T: float
+    """Difference from the prediction by all readings that are no outliers, and its standard
+    deviation."""
     map: str | None = None
+    """Name of the map among those that the study lists; None if it lists none."""
 
 
 def outliers_of(update: InferenceResult, campaign: Campaign) -> tuple[Outlier, ...]:
@@ -117,16 +108,11 @@ def _excluding(inference: Inference, outliers: Sequence[Outlier]) -> Inference:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Differences of readings from their prediction by other readings.
-
-    Attributes
-    ----------
-    difference, sd : ndarray, shape (n,), in T
-        The differences and their standard deviations.
-    """
+    """Differences of readings from their prediction by other readings."""
 
     difference: Floats
     sd: Floats
+    """The differences and their standard deviations. Shape (n,), in T."""
 
 
 def leave_one_out(
@@ -143,7 +129,6 @@ def leave_one_out(
         H L, the covariance factor of the readings that the blocks cause.
     residual : ndarray, shape (n,), in T
         Readings less the prior prediction of the model.
-    noise : NoiseCovariance
     used : ndarray of bool, shape (n,)
         Readings from which the prediction is made.
     """
@@ -225,22 +210,16 @@ def _crowded(
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """The readings of one component with their neighbours.
-
-    Attributes
-    ----------
-    rows : ndarray, shape (k,)
-        Numbers of the readings.
-    nearest : ndarray, shape (k, neighbours)
-        Neighbours of each reading, as positions in ``rows``, the nearest first.
-    terms : ndarray, shape (k, neighbours, 10)
-        Second-order monomials of the scaled distance from the reading to its neighbours. At the
-        reading itself all but the first are 0.
-    """
+    """The readings of one component with their neighbours."""
 
     rows: Ints
+    """Numbers of the readings. Shape (k,)."""
     nearest: Ints
+    """Neighbours of each reading, as positions in ``rows``, the nearest first.
+    Shape (k, neighbours)."""
     terms: Floats
+    """Second-order monomials of the scaled distance from the reading to its neighbours. At the
+    reading itself all but the first are 0. Shape (k, neighbours, 10)."""
 
     @classmethod
     def of(cls, rows: Ints, positions: Floats) -> _Neighbourhood:

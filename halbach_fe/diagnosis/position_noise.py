@@ -35,25 +35,17 @@ CANDIDATE_SDS_M = np.geomspace(2e-5, 5e-4, 8)
 
 @dataclass(frozen=True)
 class PositionNoise:
-    """The evidence and the size of random errors of the positions.
-
-    Attributes
-    ----------
-    log_bayes_factor : float
-        Log Bayes factor, averaged over the candidate sizes, over the better of two alternatives: no
-        such errors, or noise that is larger everywhere by the best factor.
-    sd_m : float
-        The likeliest standard deviation of a position along each axis.
-    map : str or None
-        Name of the map among those that the study lists; None if it lists none.
-    over_none : float
-        Log Bayes factor over no such errors, with noise of the stated size.
-    """
+    """The evidence and the size of random errors of the positions."""
 
     log_bayes_factor: float
+    """Log Bayes factor, averaged over the candidate sizes, over the better of two alternatives: no
+    such errors, or noise that is larger everywhere by the best factor."""
     sd_m: float
+    """The likeliest standard deviation of a position along each axis."""
     map: str | None = None
+    """Name of the map among those that the study lists; None if it lists none."""
     over_none: float = 0.0
+    """Log Bayes factor over no such errors, with noise of the stated size."""
 
 
 def estimate_position_noise(
@@ -64,8 +56,6 @@ def estimate_position_noise(
 
     Parameters
     ----------
-    update : InferenceResult
-    campaign : Campaign
     marginal : Marginal
         The training readings with the blocks integrated out.
     columns : ndarray, shape (n, k)
@@ -106,8 +96,6 @@ def _of_map(
 
     Parameters
     ----------
-    update : InferenceResult
-    scanned : ScannedMap
     points : ndarray, shape (n, 3), in m
         The map's points in the magnet.
     own : ndarray of int, shape (rows,)

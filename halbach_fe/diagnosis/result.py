@@ -31,23 +31,16 @@ from halbach_fe.study.model import Study
 
 @dataclass(frozen=True)
 class SolverErrorExplanation:
-    """A misfit that is no larger than the solver's error from its mesh and open boundary.
-
-    Attributes
-    ----------
-    chi2_noise, chi2_errors : float
-        Chi-squared per training reading with the blocks integrated out: for the noise alone, and
-        for noise and solver error together.
-    largest_error_T : float
-        Largest solver error of any reading.
-    largest_over_noise : float
-        Largest ratio of a reading's solver error to its noise.
-    """
+    """A misfit that is no larger than the solver's error from its mesh and open boundary."""
 
     chi2_noise: float
     chi2_errors: float
+    """Chi-squared per training reading with the blocks integrated out: for the noise alone, and for
+    noise and solver error together."""
     largest_error_T: float
+    """Largest solver error of any reading."""
     largest_over_noise: float
+    """Largest ratio of a reading's solver error to its noise."""
 
 
 def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation | None:
@@ -77,27 +70,19 @@ Floor = Mapping[str, float] | Mapping[str, Mapping[str, float]]
 
 @dataclass(frozen=True)
 class IdentifiedEffect:
-    """An effect that the diagnosis found to be missing from the study.
-
-    Attributes
-    ----------
-    hypothesis : Hypothesis
-    values, sd : ndarray, shape (k,)
-        Posterior mean and standard deviation of its amplitudes, in the units of its parameters.
-        Once the effect is in the model, the amplitudes of its refinements follow those of its
-        parameters.
-    selection : SelectedEffect
-        Log Bayes factor, posterior odds, and the alternatives that the readings cannot distinguish
-        from this effect.
-    rivals : tuple of IdentifiedEffect
-        These alternatives, each with the amplitudes that it would have in place of this effect.
-    """
+    """An effect that the diagnosis found to be missing from the study."""
 
     hypothesis: Hypothesis
     values: Floats
     sd: Floats
+    """Posterior mean and standard deviation of its amplitudes, in the units of its parameters. Once
+    the effect is in the model, the amplitudes of its refinements follow those of its parameters.
+    Shape (k,)."""
     selection: SelectedEffect
+    """Log Bayes factor, posterior odds, and the alternatives that the readings cannot distinguish
+    from this effect."""
     rivals: tuple[IdentifiedEffect, ...] = ()
+    """These alternatives, each with the amplitudes that it would have in place of this effect."""
 
     @property
     def place(self) -> Place:
@@ -124,32 +109,22 @@ class IdentifiedEffect:
 
 @dataclass(frozen=True)
 class FoundPose:
-    """Where a map lies, found from nothing.
-
-    Attributes
-    ----------
-    best : Registration
-        The most probable pose.
-    instrument : Instrument
-        The instrument of the study with that pose.
-    open : InstrumentSd
-        How far that pose, and the probe, are open from then on.
-    others : tuple of float
-        Probabilities of the other poses that the map hardly tells from the best one.
-    misfit_before, misfit_after : float
-        Rms difference from the nominal magnet in the stated and in the best pose, relative to the
-        map's rms; infinite for points that the study states inside of material.
-    map : str or None
-        Name of the map among those that the study lists; None if it lists none.
-    """
+    """Where a map lies, found from nothing."""
 
     best: Registration
+    """The most probable pose."""
     instrument: Instrument
+    """The instrument of the study with that pose."""
     open: InstrumentSd
+    """How far that pose, and the probe, are open from then on."""
     others: tuple[float, ...]
+    """Probabilities of the other poses that the map hardly tells from the best one."""
     misfit_before: float
     misfit_after: float
+    """Rms difference from the nominal magnet in the stated and in the best pose, relative to the
+    map's rms; infinite for points that the study states inside of material."""
     map: str | None = None
+    """Name of the map among those that the study lists; None if it lists none."""
 
     @property
     def text(self) -> str:
@@ -165,35 +140,24 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Effects one of which is likelier than not to be missing, without certainty.
-
-    Attributes
-    ----------
-    effects : tuple of str
-        Names of the effects, the likeliest first.
-    probability : float
-        Posterior probability that one of them is missing.
-    hypothesis : Hypothesis
-        The likeliest effect at its likeliest place.
-    shares : tuple of float
-        Probability of each of the effects.
-    log_bayes_factor : float
-        Of the likeliest effect at its place.
-    reason : str
-        Why it is not named: ``odds`` that are too small; the readings do not tell ``which`` of
-        several it is; its amplitude would be ``impossible``; its signature was computed only
-        ``roughly``; or the search ``dropped`` it again.
-    fitted : tuple of IdentifiedEffect
-        Each of the effects at its likeliest place, with the amplitudes that it would have.
-    """
+    """Effects one of which is likelier than not to be missing, without certainty."""
 
     effects: tuple[str, ...]
+    """Names of the effects, the likeliest first."""
     probability: float
+    """Posterior probability that one of them is missing."""
     hypothesis: Hypothesis
+    """The likeliest effect at its likeliest place."""
     shares: tuple[float, ...]
+    """Probability of each of the effects."""
     log_bayes_factor: float
+    """Of the likeliest effect at its place."""
     reason: Literal["odds", "which", "impossible", "roughly", "dropped"] = "odds"
+    """Why it is not named: ``odds`` that are too small; the readings do not tell ``which`` of
+    several it is; its amplitude would be ``impossible``; its signature was computed only
+    ``roughly``; or the search ``dropped`` it again."""
     fitted: tuple[IdentifiedEffect, ...] = ()
+    """Each of the effects at its likeliest place, with the amplitudes that it would have."""
 
 
 @dataclass(frozen=True)
@@ -202,66 +166,45 @@ class Imitation:
 
     With one of them the magnetizations of an update without it are off by more than their error
     bars.
-
-    Attributes
-    ----------
-    probability : float
-        Posterior probability that such an effect is missing, if at most one more is.
-    effects : tuple of str
-        Names of the likeliest of them.
-    shares : tuple of float
-        Probability of each of these.
-    fitted : tuple of IdentifiedEffect
-        The effects at their likeliest places, with the amplitudes that they would have.
     """
 
     probability: float
+    """Posterior probability that such an effect is missing, if at most one more is."""
     effects: tuple[str, ...]
+    """Names of the likeliest of them."""
     shares: tuple[float, ...]
+    """Probability of each of these."""
     fitted: tuple[IdentifiedEffect, ...] = ()
+    """The effects at their likeliest places, with the amplitudes that they would have."""
 
 
 @dataclass(frozen=True)
 class UnknownPart:
-    """One term of a discrepancy that no effect of the catalogue explains.
-
-    Attributes
-    ----------
-    acts_on : str
-        ``field``; or ``readings``, ``gains`` or ``positions`` of the instrument.
-    along : str
-        Coordinate of which it is a function: ``z``, ``angle``, ``radius``, ``time``, ``field`` (the
-        magnitude of B) or ``z and angle``; empty for a field.
-    or_else : tuple of str
-        What explains the readings as well: what it acts on, and the coordinate.
-    components : tuple of str
-        Components of the readings or the positions; empty for a field.
-    smooth : bool
-        Whether it varies smoothly, rather than roughly.
-    rms_T, largest_T : float
-        Its size in the readings.
-    size : float
-        Rms error of the readings in T, of the gains, or of the positions in m; 0 for a field.
-    half_wave : float or None
-        Distance along the coordinate over which it typically changes its sign, in m, degrees, T or
-        as a fraction of the map's time; None if it is constant.
-    log_bayes_factor : float
-    map : str or None
-        Name of the map on whose instrument it acts, among those that the study lists; None for a
-        field, and for the only map.
-    """
+    """One term of a discrepancy that no effect of the catalogue explains."""
 
     acts_on: Literal["field", "readings", "gains", "positions"]
+    """``field``; or ``readings``, ``gains`` or ``positions`` of the instrument."""
     along: str
+    """Coordinate of which it is a function: ``z``, ``angle``, ``radius``, ``time``, ``field`` (the
+    magnitude of B) or ``z and angle``; empty for a field."""
     or_else: tuple[str, ...]
+    """What explains the readings as well: what it acts on, and the coordinate."""
     components: tuple[str, ...]
+    """Components of the readings or the positions; empty for a field."""
     smooth: bool
+    """Whether it varies smoothly, rather than roughly."""
     rms_T: float
     largest_T: float
+    """Its size in the readings."""
     size: float
+    """Rms error of the readings in T, of the gains, or of the positions in m; 0 for a field."""
     half_wave: float | None
+    """Distance along the coordinate over which it typically changes its sign, in m, degrees, T or
+    as a fraction of the map's time; None if it is constant."""
     log_bayes_factor: float
     map: str | None = None
+    """Name of the map on whose instrument it acts, among those that the study lists; None for a
+    field, and for the only map."""
 
 
 @dataclass(frozen=True)
@@ -270,78 +213,54 @@ class UnknownCause:
 
     It is modelled as a field, or as functions of coordinates that act on readings or positions, see
     `halbach_fe.diagnosis.flexible_causes`.
-
-    Attributes
-    ----------
-    kind : str
-        ``field``: the discrepancy solves Maxwell's equations in the bore, so that a source outside
-        the bore is missing; ``instrument``: it does not, so that the sensors are in error;
-        ``either``: the readings do not distinguish the two, or not all of it solves them.
-    log_bayes_factor : float
-        Log Bayes factor of the discrepancy over no effect at all if ``alone`` or ``ambiguous``, and
-        over the identified effects otherwise.
-    alone : bool
-        Whether the unknown cause by itself explains the readings better than all identified effects
-        together, or no effect was identified. The diagnosis then reports no effects.
-    ambiguous : bool
-        Whether the unknown cause by itself is about as probable as several identified effects
-        together, so that it may be the true explanation in their place. The effects are still
-        reported. In diagnosis.json this is the key ``as_well``.
-    largest_T : float
-        Largest magnitude of the discrepancy at any point of the map.
-    at_m : tuple of float
-        Position of that point.
-    source_m : tuple of float or None
-        Position of the point dipole that explains the readings best, if a field is the likelier
-        kind and point dipoles are in the catalogue.
-    parts : tuple of UnknownPart
-        The terms of which it is modelled, the largest first.
     """
 
     kind: Literal["field", "instrument", "either"]
+    """``field``: the discrepancy solves Maxwell's equations in the bore, so that a source outside
+    the bore is missing; ``instrument``: it does not, so that the sensors are in error; ``either``:
+    the readings do not distinguish the two, or not all of it solves them."""
     log_bayes_factor: float
+    """Log Bayes factor of the discrepancy over no effect at all if ``alone`` or ``ambiguous``, and
+    over the identified effects otherwise."""
     alone: bool
+    """Whether the unknown cause by itself explains the readings better than all identified effects
+    together, or no effect was identified. The diagnosis then reports no effects."""
     ambiguous: bool
+    """Whether the unknown cause by itself is about as probable as several identified effects
+    together, so that it may be the true explanation in their place. The effects are still reported.
+    In diagnosis.json this is the key ``as_well``."""
     largest_T: float
+    """Largest magnitude of the discrepancy at any point of the map."""
     at_m: tuple[float, ...]
+    """Position of that point."""
     source_m: tuple[float, ...] | None
+    """Position of the point dipole that explains the readings best, if a field is the likelier kind
+    and point dipoles are in the catalogue."""
     parts: tuple[UnknownPart, ...] = ()
+    """The terms of which it is modelled, the largest first."""
 
 
 @dataclass(frozen=True)
 class PossiblePosition:
-    """A displacement of the map that the readings do not exclude.
-
-    Attributes
-    ----------
-    amplitudes : dict of str to tuple of float
-        Amplitudes by name of the effects that amount to it, such as ``wrong_line``.
-    probability : float
-        Among the positions that the readings do not exclude.
-    """
+    """A displacement of the map that the readings do not exclude."""
 
     amplitudes: dict[str, tuple[float, ...]]
+    """Amplitudes by name of the effects that amount to it, such as ``wrong_line``."""
     probability: float
+    """Among the positions that the readings do not exclude."""
 
 
 @dataclass(frozen=True)
 class DetectionLimits:
-    """The smallest changes of single blocks that a map would have shown.
-
-    Attributes
-    ----------
-    blocks : tuple of str
-        Names of the blocks that are magnetized.
-    loss : ndarray, shape (blocks,)
-        Part of the magnetization whose loss would have been named; above 1, if not even the
-        missing block would have been.
-    displacement_m : ndarray, shape (blocks,)
-        Displacement in the direction in which it is least visible.
-    """
+    """The smallest changes of single blocks that a map would have shown."""
 
     blocks: tuple[str, ...]
+    """Names of the blocks that are magnetized."""
     loss: Floats
+    """Part of the magnetization whose loss would have been named; above 1, if not even the missing
+    block would have been. Shape (blocks,)."""
     displacement_m: Floats
+    """Displacement in the direction in which it is least visible. Shape (blocks,)."""
 
     def worst(self, limits: Floats) -> str:
         """Return the name of the block with the largest of some limits (blocks,)."""

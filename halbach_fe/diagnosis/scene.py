@@ -42,40 +42,27 @@ FieldAt = Callable[[Study, Floats], Floats]
 
 @dataclass(frozen=True)
 class ScannedMap:
-    """Where and when the probe was for a map.
-
-    Attributes
-    ----------
-    name, probe, pose : str
-        See `halbach_fe.measurement.campaign.Map`.
-    number : int or None
-        Its number among the maps that the study lists; None if it has the study's own instrument.
-    is_validation : bool
-    points : ndarray, shape (n, 3), in m
-        As the map states them, along the magnet's axes.
-    time : ndarray, shape (n,)
-        From 0 to 1.
-    rows : slice
-        Of its points among those of all maps.
-    missing : ndarray of bool, shape (n, 3)
-        Which components were not read.
-    is_total : bool
-        Whether it is a map of |B| alone.
-    timed : bool
-        Whether it has times; else ``time`` is the order of its rows.
-    """
+    """Where and when the probe was for a map."""
 
     name: str
     probe: str
     pose: str
+    """See `halbach_fe.measurement.campaign.Map`."""
     number: int | None
+    """Its number among the maps that the study lists; None if it has the study's own instrument."""
     is_validation: bool
     points: Floats
+    """As the map states them, along the magnet's axes. Shape (n, 3), in m."""
     time: Floats
+    """From 0 to 1. Shape (n,)."""
     rows: slice
+    """Of its points among those of all maps."""
     missing: Bools
+    """Which components were not read. Shape (n, 3)."""
     is_total: bool = False
+    """Whether it is a map of |B| alone."""
     timed: bool = True
+    """Whether it has times; else ``time`` is the order of its rows."""
 
     def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
         """Tell whether the map can show an effect, and be corrected for it.
@@ -109,21 +96,14 @@ class ScannedMap:
 
 @dataclass(frozen=True)
 class Campaign:
-    """All maps of a diagnosis, and effects seen in them.
-
-    Attributes
-    ----------
-    maps : tuple of ScannedMap
-        Those that the study lists, or the only one; and the validation map, if there is one.
-    data : Dataset or dict of str to Dataset
-        The maps themselves, without a validation map.
-    blocks : BlockTable or None
-        Measured blocks, which a study with effects must be able to have.
-    """
+    """All maps of a diagnosis, and effects seen in them."""
 
     maps: tuple[ScannedMap, ...]
+    """Those that the study lists, or the only one; and the validation map, if there is one."""
     data: xr.Dataset | Mapping[str, xr.Dataset]
+    """The maps themselves, without a validation map."""
     blocks: BlockTable | None = None
+    """Measured blocks, which a study with effects must be able to have."""
 
     @classmethod
     def of(
@@ -212,7 +192,6 @@ class Campaign:
 
         Parameters
         ----------
-        study : Study
         field : callable, optional
             Field of the nominal magnet of a study, see `FieldAt`, for effects that need it solved.
         iron : callable, optional
@@ -244,17 +223,11 @@ class Campaign:
 
 @dataclass(frozen=True)
 class Scene:
-    """The nominal magnet of a study, and its field at the points of all maps.
-
-    Attributes
-    ----------
-    maps : tuple of ScannedMap
-    fields : tuple of NominalFields
-        One for each map, with the part of the study that holds for it.
-    """
+    """The nominal magnet of a study, and its field at the points of all maps."""
 
     maps: tuple[ScannedMap, ...]
     fields: tuple[NominalFields, ...]
+    """One for each map, with the part of the study that holds for it."""
 
     @cached_property
     def points(self) -> Floats:

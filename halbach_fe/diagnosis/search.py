@@ -42,52 +42,37 @@ SHOWN_PROBABILITY = 1e-3
 
 @dataclass(frozen=True)
 class Search:
-    """The comparison of all hypotheses at one point of linearization.
-
-    Attributes
-    ----------
-    hypotheses : tuple of Hypothesis
-    candidates : tuple of Candidate
-        The same hypotheses, with the numbers of their columns.
-    evidence : Evidence
-        Evidence of all columns.
-    columns : ndarray, shape (rows, k)
-        Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes;
-        rough ones, see `Effect.rough_signature`, may have any size.
-    absorbed : ndarray, shape (m, k + 1)
-        `Marginal.absorbed` of the columns and the residual.
-    residual : ndarray, shape (rows,)
-        Whitened residual of the training readings from the prior mean of the study without the
-        identified effects; the columns are fitted to it.
-    marginal : Marginal
-        The readings with blocks and solver error integrated out.
-    training : ndarray, shape (rows,)
-        Whitened residual of the training readings with the identified effects in the model.
-    campaign : Campaign
-    nominal : Scene
-        Of the study from which the search started.
-    uncompared : int
-        Number of hypotheses for which there was no time.
-    rough : frozenset of int
-        Numbers of the hypotheses with rough signatures. They explain too little to be solved for,
-        and cannot be selected.
-    given_up : frozenset of int
-        Numbers of hypotheses that cannot be selected as the search dropped them in their own model.
-    """
+    """The comparison of all hypotheses at one point of linearization."""
 
     hypotheses: tuple[Hypothesis, ...]
     candidates: tuple[Candidate, ...]
+    """The same hypotheses, with the numbers of their columns."""
     evidence: Evidence
+    """Evidence of all columns."""
     columns: Floats
+    """Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes;
+    rough ones, see `Effect.rough_signature`, may have any size. Shape (rows, k)."""
     absorbed: Floats
+    """`Marginal.absorbed` of the columns and the residual. Shape (m, k + 1)."""
     residual: Floats
+    """Whitened residual of the training readings from the prior mean of the study without the
+    identified effects; the columns are fitted to it. Shape (rows,)."""
     marginal: Marginal
+    """The readings with blocks and solver error integrated out."""
     training: Floats
+    """Whitened residual of the training readings with the identified effects in the model.
+    Shape (rows,)."""
     campaign: Campaign
     nominal: Scene
+    """Of the study from which the search started."""
     uncompared: int = 0
+    """Number of hypotheses for which there was no time."""
     rough: frozenset[int] = frozenset()
+    """Numbers of the hypotheses with rough signatures. They explain too little to be solved for,
+    and cannot be selected."""
     given_up: frozenset[int] = frozenset()
+    """Numbers of hypotheses that cannot be selected as the search dropped them in their own
+    model."""
 
     @property
     def excluded(self) -> frozenset[int]:
@@ -273,8 +258,6 @@ def score_hypotheses(
 
     Parameters
     ----------
-    point : Linearization
-    effects : sequence of Effect
     progress : callable, optional
         Called with the numbers of finished and of all hypotheses.
     is_over : callable, optional
@@ -296,15 +279,12 @@ def _improved_place(
 
     Parameters
     ----------
-    effect : Effect
-    places : sequence of Place
     columns : sequence of ndarray, shape (rows, k)
         Whitened signatures at these places per prior standard deviation.
     derivative : callable
         Takes a place and all amplitudes; returns whitened derivatives (rows, k + r).
     fixed : ndarray, shape (rows, f)
         Whitened signatures of effects in the model, whose amplitudes are free.
-    marginal : Marginal
     residual : ndarray, shape (rows,)
 
     Returns
@@ -356,11 +336,7 @@ def identify_effects(
     candidate is excluded and the selection repeated. Those with rough signatures are excluded: they
     explain too little, also in place of one that is impossible.
 
-    Parameters
-    ----------
-    corrected : Study
-        The study corrected for gross errors and outliers.
-    search : Search
+    ``corrected``: the study corrected for gross errors and outliers.
     """
     excluded = set(search.excluded)
     while True:

@@ -67,30 +67,21 @@ PERCENT_PARAMETERS = {"gain", LOSS, "gradient", "scale"}
 
 @dataclass(frozen=True)
 class RegionFit:
-    """How well a model agrees with the readings of a region.
-
-    Attributes
-    ----------
-    region, part : str
-    readings : int
-        Number of readings.
-    chi2_per_reading : float
-        Chi-squared per reading by the full covariance of prediction and noise. The prediction is
-        the prior one for training readings, and the posterior one for held-out readings.
-    rms_T : dict of str to float
-        Rms difference of the posterior prediction from the readings, by component (``Bx``) or kind
-        of Fourier coefficient.
-    coverage95 : float
-        Fraction of the readings within the 95 % band of their prediction. Training readings are
-        compared with their leave-one-out prediction.
-    """
+    """How well a model agrees with the readings of a region."""
 
     region: str
     part: str
     readings: int
+    """Number of readings."""
     chi2_per_reading: float
+    """Chi-squared per reading by the full covariance of prediction and noise. The prediction is the
+    prior one for training readings, and the posterior one for held-out readings."""
     rms_T: dict[str, float]
+    """Rms difference of the posterior prediction from the readings, by component (``Bx``) or kind
+    of Fourier coefficient."""
     coverage95: float
+    """Fraction of the readings within the 95 % band of their prediction. Training readings are
+    compared with their leave-one-out prediction."""
 
 
 def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[RegionFit]:
@@ -251,31 +242,21 @@ def _in_map(name: str | None) -> str:
 
 @dataclass(frozen=True)
 class OtherFinding:
-    """Text on a finding of the diagnosis that is not an effect of the catalogue.
-
-    Attributes
-    ----------
-    name, title, kind : str
-    amount : str
-        Size of the finding.
-    sentence : str
-        The finding in a sentence.
-    place : str
-        Its place, if there is one.
-    log_bayes_factor : float
-        NaN if there is none.
-    instead : str
-        Standard names of findings that the map does not distinguish from this one.
-    """
+    """Text on a finding of the diagnosis that is not an effect of the catalogue."""
 
     name: str
     title: str
     kind: str
     amount: str
+    """Size of the finding."""
     sentence: str
+    """The finding in a sentence."""
     place: str = EMPTY_CELL
+    """Its place, if there is one."""
     log_bayes_factor: float = math.nan
+    """NaN if there is none."""
     instead: str = EMPTY_CELL
+    """Standard names of findings that the map does not distinguish from this one."""
 
 
 def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:

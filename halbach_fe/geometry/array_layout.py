@@ -218,10 +218,7 @@ def _remanence_of_moment(array: Array, block: MagnetBlock) -> float:
     1 + N (mu_r - 1), with the demagnetizing factor N, at most some 2 %. The nominal moment of a
     study is not corrected for that.
 
-    Raises
-    ------
-    StudyError
-        If the remanence is larger than that of any magnet material.
+    StudyError if the remanence is larger than that of any magnet material.
     """
     assert array.block_moment_A_m2 is not None  # the study model guarantees both
     assert array.ring_length_m is not None

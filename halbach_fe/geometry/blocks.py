@@ -31,62 +31,44 @@ from halbach_fe.study.materials import MU_0
 
 @dataclass(frozen=True)
 class MagnetBlock:
-    """One block of the array.
-
-    Attributes
-    ----------
-    ring, slot : int
-        Counted from 1.
-    outline : Outline
-        Outline of its nominal place in the (x, y) plane of its frame, in m.
-    z_min, z_max : float, in m
-        Limits of its nominal place along the z axis of its frame; infinite in 2D.
-    easy_axis : tuple of 3 floats
-        Unit vector along x, y and z of the magnet, rotated with the block.
-    remanence : float, in T
-        Negative for a block that is mounted upside down.
-    recoil_permeability, recoil_permeability_across : float
-        Relative, along the easy axis and perpendicular to it.
-    displacement_m : tuple of 3 floats
-        Displacement from the nominal place along x, y and z.
-    rotation_rad : tuple of 3 floats
-        Rotation vector, about the block's middle.
-    gradient, corner_loss : float
-        Non-uniformity of the magnetization, see ``magnetization_gradient`` and
-        ``inner_corner_loss`` of `halbach_fe.study.array.BlockException`.
-    mounted_from : tuple of 2 ints, optional
-        Ring and slot that the block was made for, if that is another place.
-    origin_m : tuple of 3 floats
-        Origin of the block's frame in the magnet; zero for blocks of rings.
-    orientation_rad : tuple of 3 floats
-        Rotation vector that turns the magnet's axes into those of the frame; zero for blocks of
-        rings.
-    label : str, optional
-        The name of a free block.
-    angle_deg, facing_deg : float
-        Nominal angles to the x axis of the block's position about the z axis, and of its
-        thickness.
-    """
+    """One block of the array."""
 
     ring: int
     slot: int
+    """Counted from 1."""
     outline: Outline
+    """Outline of its nominal place in the (x, y) plane of its frame, in m."""
     z_min: float
     z_max: float
+    """Limits of its nominal place along the z axis of its frame; infinite in 2D. In m."""
     easy_axis: tuple[float, float, float]
+    """Unit vector along x, y and z of the magnet, rotated with the block."""
     remanence: float
+    """Negative for a block that is mounted upside down. In T."""
     recoil_permeability: float
     recoil_permeability_across: float
+    """Relative, along the easy axis and perpendicular to it."""
     displacement_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Displacement from the nominal place along x, y and z."""
     rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector, about the block's middle."""
     gradient: float = 0.0
     corner_loss: float = 0.0
+    """Non-uniformity of the magnetization, see ``magnetization_gradient`` and ``inner_corner_loss``
+    of `halbach_fe.study.array.BlockException`."""
     mounted_from: tuple[int, int] | None = None
+    """Ring and slot that the block was made for, if that is another place."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Origin of the block's frame in the magnet; zero for blocks of rings."""
     orientation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector that turns the magnet's axes into those of the frame; zero for blocks of
+    rings."""
     label: str | None = None
+    """The name of a free block."""
     angle_deg: float = 0.0
     facing_deg: float = 0.0
+    """Nominal angles to the x axis of the block's position about the z axis, and of its
+    thickness."""
 
     @property
     def has_four_edges(self) -> bool:

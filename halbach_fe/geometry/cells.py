@@ -62,7 +62,6 @@ def halved(
         Least and largest coordinates of each cell.
     place : callable
         Takes coordinates (m, k) and returns points (m, 3) in m.
-    distance : callable
     share : float
         Longest side of a cell, relative to the distance of its middle.
     most : int

@@ -23,7 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints, azimuths_of
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of, slices
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.outline import Edge, Outline
 
@@ -174,10 +174,7 @@ def _directions(corners: Floats) -> Floats:
 def _convex(corners: Floats) -> list[Floats]:
     """Split a simple polygon (n, 2) into convex ones: itself, or triangles.
 
-    Raises
-    ------
-    StudyError
-        If its edges cross.
+    StudyError if its edges cross.
     """
     corners = _simplified(corners)
     previous = np.arange(len(corners)) - 1
@@ -374,8 +371,7 @@ def _smallest_overlap(
 def _lumps(rows: Ints, size: int) -> Iterator[Ints]:
     """Split row numbers so that every part has at most `_PROJECTIONS` axes of ``size`` each."""
     step = max(1, _PROJECTIONS // (8 * size))
-    for start in range(0, len(rows), step):
-        yield rows[start:start + step]
+    return (rows[part] for part in slices(len(rows), step))
 
 
 def _overlap(axes: Floats, first: Floats, second: Floats) -> Floats:
@@ -383,8 +379,8 @@ def _overlap(axes: Floats, first: Floats, second: Floats) -> Floats:
     length = np.linalg.norm(axes, axis=2)
     smallest = np.full(len(axes), np.inf)
     step = max(1, _PROJECTIONS // (len(axes) * (first.shape[1] + second.shape[1])))
-    for start in range(0, axes.shape[1], step):
-        some, scale = axes[:, start:start + step], length[:, start:start + step]
+    for part in slices(axes.shape[1], step):
+        some, scale = axes[:, part], length[:, part]
         a, b = (some @ points.swapaxes(1, 2) for points in (first, second))
         overlap = np.minimum(a.max(axis=2) - b.min(axis=2), b.max(axis=2) - a.min(axis=2))
         # an axis of no length, of parallel edges or of coincident centres, tells nothing

@@ -156,10 +156,6 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
     ring and slot stay. The remanence is a vector along the magnet's axes, so that any direction and
     sign is exact.
 
-    Parameters
-    ----------
-    magnet : Magnet
-
     Returns
     -------
     dict of list

@@ -41,45 +41,33 @@ AROUND = 96
 
 @dataclass(frozen=True)
 class IronSolid:
-    """One body of iron.
-
-    Attributes
-    ----------
-    inner_radius, outer_radius : float, in m
-        Of a tube about the z axis; the inner radius of a disc is 0. Of a prism, the radii of the
-        cylinders about the z axis that it lies between.
-    z_min, z_max : float, in m
-        Infinite in 2D.
-    outline : Outline, optional
-        Outline of a prism in the (x, y) plane; None for a tube or sphere.
-    law : float or Curve
-        Relative permeability, or magnetization curve.
-    origin_m, turn_rad : tuple of float
-        Place of the origin of the body's own axes, in which all of the above is, and the rotation
-        vector that turns the magnet's axes into them.
-    sphere : bool
-        Whether it is a sphere of ``outer_radius``.
-    triangles : ndarray, shape (n, 3, 3), in m, optional
-        Of the surface of a body of any shape, with their normals outwards.
-    holes : tuple
-        Holes along z of a prism, each the corners (n, 2) in m of a polygon, or for a round one its
-        middle and radius (3,). The triangles have them too, round ones with 48 sides.
-    profile : ndarray, shape (n, 2), in m, optional
-        Corners r and z of a body of revolution; the triangles are 96 around it.
-    """
+    """One body of iron."""
 
     inner_radius: float
     outer_radius: float
+    """Of a tube about the z axis; the inner radius of a disc is 0. Of a prism, the radii of the
+    cylinders about the z axis that it lies between. In m."""
     z_min: float
     z_max: float
+    """Infinite in 2D. In m."""
     outline: Outline | None = None
+    """Outline of a prism in the (x, y) plane; None for a tube or sphere."""
     law: float | Curve = field(default=1.0, compare=False)
+    """Relative permeability, or magnetization curve."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place of the origin of the body's own axes, in which all of the above is, and the rotation
+    vector that turns the magnet's axes into them."""
     sphere: bool = False
+    """Whether it is a sphere of ``outer_radius``."""
     triangles: Floats | None = field(default=None, compare=False)
+    """Of the surface of a body of any shape, with their normals outwards. Shape (n, 3, 3), in m."""
     holes: tuple[Floats, ...] = field(default=(), compare=False)
+    """Holes along z of a prism, each the corners (n, 2) in m of a polygon, or for a round one its
+    middle and radius (3,). The triangles have them too, round ones with 48 sides."""
     profile: Floats | None = field(default=None, compare=False)
+    """Corners r and z of a body of revolution; the triangles are 96 around it.
+    Shape (n, 2), in m."""
 
     @property
     def in_place(self) -> bool:

@@ -20,7 +20,13 @@ from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
-from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
+from halbach_fe.geometry.blocks import (
+    MagnetBlock,
+    bore_radius,
+    moved_block,
+    present_blocks,
+    rotation_matrix,
+)
 from halbach_fe.geometry.coils import (
     closest,
     distance_in_magnet,
@@ -289,6 +295,23 @@ class Magnet(ShownInNotebook):
         rounding_rad = 1e-6
         return bool(widest < np.pi + rounding_rad and not self.contains(axis).any())
 
+    @cached_property
+    def cancels_along_z(self) -> bool:
+        """Whether what the blocks make on the z axis cancels along it, as in an undulator.
+
+        Their moments count as dipoles, whose field integrated along z is m / w^2 at a distance w.
+        """
+        small = 0.01  # of what they could make together
+        blocks = [block for block in present_blocks(self.blocks) if np.hypot(*block.middle[:2])]
+        if self.dimension == 2 or not blocks:
+            return False
+        moments = np.array([block.volume * block.magnetization for block in blocks])
+        places = np.array([block.middle for block in blocks])[:, :2] @ [1, 1j]
+        apart = np.abs(places) ** 2
+        most = small * float(np.sum(np.linalg.norm(moments, axis=1) / apart))
+        across = abs(np.sum(moments[:, :2] @ [1, 1j] / places ** 2))
+        return bool(across <= most and abs(np.sum(moments[:, 2] / apart)) <= most)
+
     @property
     def iron_half_length(self) -> float:
         """Largest |z| in m of the iron, or of the array without iron; infinite in 2D."""
@@ -350,7 +373,7 @@ class Magnet(ShownInNotebook):
         Parameters
         ----------
         points_m : array_like, shape (..., 3), in m
-            Of a DataArray, DataFrame or Series that names x, y and z, these, in any order.
+            Of a DataArray, DataFrame, Series or dict that names x, y and z, these, in any order.
 
         Returns
         -------
@@ -471,12 +494,7 @@ def _check_neighbours(
     dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None,
     neighbours: tuple[Neighbour, ...],
 ) -> None:
-    """Refuse neighbouring magnets in the place of the magnet or of one another.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse neighbouring magnets in the place of the magnet or of one another."""
     own = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
     reach = max(abs(end) for block in own for end in (block.z_min, block.z_max))
     solids = iron_solids(dimension, iron_ring, iron, reach)
@@ -503,12 +521,7 @@ NEAR = 0.1
 
 @lru_cache(maxsize=128)
 def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
-    """Refuse coils in the winding of another one; they may touch.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse coils in the winding of another one; they may touch."""
     windings = [points_in_winding(coil) for coil in coils]
     steps = [np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)) for points in windings]
     middles = np.array([points.mean(axis=0) for points in windings])
@@ -557,10 +570,6 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
 
     Points of bodies are tested, and points of windings, so that thin ones are found too. Blocks and
     iron of a cross-section have no ends, so that the height of a coil does not matter.
-
-    Raises
-    ------
-    StudyError
     """
     blocks = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
     reach = max((abs(end) for block in blocks for end in (block.z_min, block.z_max)), default=0.0)
@@ -596,12 +605,7 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
 def _check_overlaps(
     dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None
 ) -> None:
-    """Refuse blocks that overlap one another or iron, in their nominal or in their real places.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse blocks that overlap one another or iron, in their nominal or in their real places."""
     # overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
     # blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm.
     rounding_overlap, table_overlap = 1e-6, 2e-4

@@ -152,7 +152,7 @@ def ring_radii(outline: Outline) -> tuple[float, float] | None:
 
 
 def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
-    """Return points inside an outline, on a grid of fractions of its thickness and width.
+    """Return points (n, m, 2) in m in an outline, on a grid of fractions of thickness and width.
 
     The points lie on straight lines between the inner face (edge 3 of every shape) and the outer
     face (edge 1).
@@ -163,10 +163,6 @@ def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
         Fractions of the thickness, from the inner face.
     width : ndarray, shape (m,)
         Fractions of the width.
-
-    Returns
-    -------
-    ndarray, shape (n, m, 2), in m
     """
     far, near = outline[1].at(width)[0], outline[3].at(1 - width)[0]
     share = depth[:, None, None]

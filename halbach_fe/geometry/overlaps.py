@@ -70,11 +70,7 @@ def block_in_iron(
 ) -> tuple[int, int, float] | None:
     """Return the first block, by number, that overlaps a body of iron.
 
-    Parameters
-    ----------
-    blocks, tolerance
-        See `overlapping_blocks`.
-    iron : sequence of IronSolid
+    ``blocks`` and ``tolerance``: see `overlapping_blocks`.
 
     Returns
     -------
@@ -168,26 +164,17 @@ def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
 
 @dataclass(frozen=True)
 class _Bodies:
-    """Prisms with their poses.
-
-    Attributes
-    ----------
-    shapes : list of Shape
-    shape : ndarray, shape (n,)
-        Number of every body's shape.
-    limits : ndarray, shape (n, 2), in m
-        Smallest and largest z in the body's frame.
-    axes : ndarray, shape (n, 3, 3)
-        Axes of the frame, as columns.
-    position : ndarray, shape (n, 3), in m
-        Origin of the frame.
-    """
+    """Prisms with their poses."""
 
     shapes: list[Shape]
     shape: Ints
+    """Number of every body's shape. Shape (n,)."""
     limits: Floats
+    """Smallest and largest z in the body's frame. Shape (n, 2), in m."""
     axes: Floats
+    """Axes of the frame, as columns. Shape (n, 3, 3)."""
     position: Floats
+    """Origin of the frame. Shape (n, 3), in m."""
 
     @cached_property
     def infinite(self) -> Bools:

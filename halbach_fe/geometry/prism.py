@@ -20,24 +20,18 @@ Curve = tuple[tuple[float, float], tuple[float, float], tuple[float, float] | No
 
 @dataclass(frozen=True)
 class Prism:
-    """A solid between two values of z.
-
-    Attributes
-    ----------
-    outline : Outline
-        Its cross-section in a frame of its own, in m.
-    z_min, z_max : float, in m
-    axes : ndarray, shape (2, 2)
-        Axes of that frame in the (x, y) plane, as columns; they may be those of a mirror image.
-    origin : ndarray, shape (2,), in m
-        Origin of that frame.
-    """
+    """A solid between two values of z."""
 
     outline: Outline
+    """Its cross-section in a frame of its own, in m."""
     z_min: float
     z_max: float
+    """In m."""
     axes: Floats = field(default_factory=lambda: np.eye(2))
+    """Axes of that frame in the (x, y) plane, as columns; they may be those of a mirror image.
+    Shape (2, 2)."""
     origin: Floats = field(default_factory=lambda: np.zeros(2))
+    """Origin of that frame. Shape (2,), in m."""
 
     def placed(self, points: Floats) -> Floats:
         """Return points (n, 2) in m of the own frame in the (x, y) plane."""

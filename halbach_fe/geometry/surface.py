@@ -51,20 +51,15 @@ def is_cross_section(points: Floats) -> bool:
 
 @dataclass(frozen=True)
 class Contact:
-    """Where points (n,) lie relative to a body.
-
-    Attributes
-    ----------
-    inside, on_edge, on_face : ndarray of bool, shape (n,)
-        At most one is true.
-    outward : ndarray, shape (n, 3), in m
-        What takes a point on a face to its place just outside; zero for others.
-    """
+    """Where points (n,) lie relative to a body."""
 
     inside: Bools
     on_edge: Bools
     on_face: Bools
+    """At most one is true. Shape (n,)."""
     outward: Floats
+    """What takes a point on a face to its place just outside; zero for others.
+    Shape (n, 3), in m."""
 
     @classmethod
     def nowhere(cls, count: int) -> Contact:
@@ -293,28 +288,20 @@ def _section(outline: Outline, points: Floats) -> _Section:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Where points (n,) lie in a magnet.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), in m
-        Points at which the field is to be evaluated: those on a face are just outside.
-    inside, on_edge : ndarray of bool, shape (n,)
-        Inside a body, and on an edge of one.
-    faces : ndarray of int, shape (n,)
-        Number of bodies on whose faces a point lies; 2 between bodies that touch.
-    names : dict of int to list of str
-        Names of the bodies whose faces or edges the point with this number touches.
-    reach : float
-        Distance in m from the middle to which the magnet reaches.
-    """
+    """Where points (n,) lie in a magnet."""
 
     points: Floats
+    """Points at which the field is to be evaluated: those on a face are just outside.
+    Shape (n, 3), in m."""
     inside: Bools
     on_edge: Bools
+    """Inside a body, and on an edge of one. Shape (n,)."""
     faces: Ints
+    """Number of bodies on whose faces a point lies; 2 between bodies that touch. Shape (n,)."""
     names: dict[int, list[str]]
+    """Names of the bodies whose faces or edges the point with this number touches."""
     reach: float = np.inf
+    """Distance in m from the middle to which the magnet reaches."""
 
     @property
     def no_air(self) -> Bools:

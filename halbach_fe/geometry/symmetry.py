@@ -36,21 +36,14 @@ _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E37
 
 @dataclass(frozen=True)
 class SymmetryImage:
-    """The reflection and rotation that map a source block to one of its copies.
-
-    Attributes
-    ----------
-    source : int
-        Number of the source block.
-    turn : float, in rad
-        Rotation about z, after the reflection.
-    mirrored : bool
-        Whether the source is reflected in the plane z = 0.
-    """
+    """The reflection and rotation that map a source block to one of its copies."""
 
     source: int
+    """Number of the source block."""
     turn: float = 0.0
+    """Rotation about z, after the reflection. In rad."""
     mirrored: bool = False
+    """Whether the source is reflected in the plane z = 0."""
 
     def to_source(self, points: Floats) -> Floats:
         """Return points (n, 3) moved by the inverse map, from the copy to the source."""
@@ -60,10 +53,8 @@ class SymmetryImage:
     def from_source(self, field: Floats) -> Floats:
         """Return the field of the copy from the field of the source at the `to_source` points.
 
-        Parameters
-        ----------
-        field : ndarray, shape (..., 3, k)
-            B per unit of magnetization along the first k axes (x, y in a cross-section).
+        ``field`` (..., 3, k): B per unit of magnetization along the first k axes (x, y in a
+        cross-section).
         """
         size = field.shape[-1]
         turn = rotation_about_z(self.turn)
@@ -89,15 +80,10 @@ def unique_points(points: Floats) -> tuple[Floats, Ints]:
 
 @dataclass(frozen=True)
 class Symmetry:
-    """The blocks of a study as images of a few source blocks.
-
-    Attributes
-    ----------
-    images : tuple of SymmetryImage
-        One image per block, in the order of the blocks.
-    """
+    """The blocks of a study as images of a few source blocks."""
 
     images: tuple[SymmetryImage, ...]
+    """One image per block, in the order of the blocks."""
 
     @cached_property
     def sources(self) -> tuple[int, ...]:
@@ -284,22 +270,15 @@ Turn = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True)
 class Move:
-    """A move of many blocks from slot to slot.
-
-    Attributes
-    ----------
-    words : str
-        What is moved, and how.
-    pairs : tuple of (int, int)
-        Number from 0 of a block's slot, and of the slot from which the block that is there comes.
-    turn : tuple or None
-        Rotation of these blocks; None if each turns with the shape of its slot, see
-        `MagnetBlock.carried_from`.
-    """
+    """A move of many blocks from slot to slot."""
 
     words: str
+    """What is moved, and how."""
     pairs: tuple[tuple[int, int], ...]
+    """Number from 0 of a block's slot, and of the slot from which the block that is there comes."""
     turn: Turn | None
+    """Rotation of these blocks; None if each turns with the shape of its slot, see
+    `MagnetBlock.carried_from`."""
 
 
 @lru_cache(maxsize=4096)
@@ -333,12 +312,8 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
 def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
     """Return the moves of rings, and of half of them, after which every block fits its slot.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    kind : str
-        ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise than
-        their places, also the blocks without their holder) or ``upside down``.
+    ``kind``: ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise
+    than their places, also the blocks without their holder) or ``upside down``.
     """
     return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
 

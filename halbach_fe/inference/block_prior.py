@@ -61,26 +61,18 @@ MANY_SD = 5.0
 
 @dataclass(frozen=True)
 class TypeSamples:
-    """The measured blocks of one type.
-
-    Attributes
-    ----------
-    label : str
-        Name of the type.
-    deviations : ndarray, shape (n, d)
-        Relative deviations from the nominal magnetization, along `DIRECTIONS`; the deviations
-        across it are angles in rad.
-    intensity : float or None
-        Intensity of the shrinkage of the covariance, if it is estimated from the samples.
-    p : ndarray, shape (d,)
-        p-values of the Anderson-Darling test for each direction, adjusted for the number of types
-        and directions; NaN if a direction was not tested.
-    """
+    """The measured blocks of one type."""
 
     label: str
+    """Name of the type."""
     deviations: Floats
+    """Relative deviations from the nominal magnetization, along `DIRECTIONS`; the deviations across
+    it are angles in rad. Shape (n, d)."""
     intensity: float | None
+    """Intensity of the shrinkage of the covariance, if it is estimated from the samples."""
     p: Floats
+    """p-values of the Anderson-Darling test for each direction, adjusted for the number of types
+    and directions; NaN if a direction was not tested. Shape (d,)."""
 
     @property
     def normal(self) -> bool:
@@ -90,29 +82,19 @@ class TypeSamples:
 
 @dataclass(frozen=True)
 class MeasuredPrior:
-    """The prior of a study's magnetizations that follows from a table of measured blocks.
-
-    Attributes
-    ----------
-    gaussian : Gaussian
-        Prior of the parameters, block by block, in A/m.
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetization.
-    placed : bool
-        Whether the prior of a block is its own measurement, not the distribution of its type.
-    types : tuple of TypeSamples
-    far : str
-        A sentence that names single blocks far from the others; empty if there are none.
-    doubts : tuple of str
-        Sentences about why the table and the study may not be of the same blocks.
-    """
+    """The prior of a study's magnetizations that follows from a table of measured blocks."""
 
     gaussian: Gaussian
+    """Prior of the parameters, block by block, in A/m."""
     nominal: Floats
+    """Nominal magnetization. Shape (parameters,), in A/m."""
     placed: bool
+    """Whether the prior of a block is its own measurement, not the distribution of its type."""
     types: tuple[TypeSamples, ...]
     doubts: tuple[str, ...] = ()
+    """Sentences about why the table and the study may not be of the same blocks."""
     far: str = ""
+    """A sentence that names single blocks far from the others; empty if there are none."""
 
     @property
     def count(self) -> int:
@@ -368,22 +350,16 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
 def as_mounted(
     magnet: Magnet, table: BlockTable, places: Ints, turned: Floats | None = None
 ) -> Floats:
-    """Return the moments of blocks in the axes of new slots.
+    """Return the moments (rows, 3) in A m^2 of blocks in the axes of new slots.
 
     A block keeps the orientation of its faces relative to those of the slot, unless it is turned.
 
     Parameters
     ----------
-    magnet : Magnet
-    table : BlockTable
     places : ndarray of int, shape (rows,)
         New slot of each block, counted from 0, ring by ring.
     turned : ndarray, shape (rows, 3, 3), optional
         Rotation of each block in its own axes.
-
-    Returns
-    -------
-    ndarray, shape (rows, 3), in A m^2
     """
     index = _block_of_rows(as_meant(magnet), table)
     own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ block.shape_axes
@@ -510,10 +486,8 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
 
     They are not changed if the study has no temperature coefficient.
 
-    Raises
-    ------
-    MeasurementError
-        If a temperature is missing, or if temperatures differ and the study has no coefficient.
+    MeasurementError if a temperature is missing, or if temperatures differ and the study has no
+    coefficient.
     """
     # Largest difference of temperatures at which moments count as measured at the same one. It
     # changes the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it.

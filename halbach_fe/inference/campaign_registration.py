@@ -43,12 +43,10 @@ def register_maps(
 
     Parameters
     ----------
-    magnet : Magnet
     maps : sequence of Map
         In the order in which they are registered: best the one first that says most about the
         blocks. Maps of one probe have the probe that the first of them finds, and those on one
         stage are turned alike.
-    session : Session
     open_keys : sequence of OpenKey, optional
         Numbers of the study that are fitted with the first map.
     say : callable, optional

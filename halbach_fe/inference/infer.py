@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -184,37 +185,26 @@ def infer(
 
 @dataclass(frozen=True)
 class _Update:
-    """One update of all parameters: those of the blocks, then what is beside them.
-
-    Attributes
-    ----------
-    readings : Readings
-    vectors, model : Response
-        The responses of `Readings.vectors` and of the readings to the parameters of the blocks.
-    matrix : Rows
-        Derivatives (readings, parameters) by all parameters.
-    exact : Rows
-        The same for a solver without the error that readings share, see `_Search._beside`: its
-        columns are 0.
-    prior : Gaussian
-    residual : ndarray, shape (readings,), in T
-        Readings less what the model reads of the nominal magnet.
-    errors : NoiseCovariance
-        Noise of the readings, with the solver's error and the bend of |B|.
-    magnitudes : Magnitudes
-        About which readings of |B| are linear.
-    update : LinearPosterior
-    """
+    """One update of all parameters: those of the blocks, then what is beside them."""
 
     readings: Readings
     vectors: Response
     model: Response
+    """The responses of `Readings.vectors` and of the readings to the parameters of the blocks."""
     matrix: Rows
+    """Derivatives (readings, parameters) by all parameters."""
     exact: Rows
+    """The same for a solver without the error that readings share, see `_Search._beside`: its
+    columns are 0."""
+    of_field: Rows
+    """The same for instruments that are known. Its columns of theirs are 0."""
     prior: Gaussian
     residual: Floats
+    """Readings less what the model reads of the nominal magnet. Shape (readings,), in T."""
     errors: NoiseCovariance
+    """Noise of the readings, with the solver's error and the bend of |B|."""
     magnitudes: Magnitudes
+    """About which readings of |B| are linear."""
     update: linear_gaussian.LinearPosterior
 
     @property
@@ -222,12 +212,11 @@ class _Update:
         """The posterior of all parameters."""
         return self.update.distribution
 
-    def predicted(self, parameters: Gaussian, exact: bool = False) -> Prediction:
-        """Return the prediction of all readings from a distribution of all parameters.
-
-        With ``exact`` the solver makes no error that readings share.
+    def predicted(self, parameters: Gaussian, matrix: Rows | None = None) -> Prediction:
+        """Return the prediction of all readings from a distribution of all parameters, by all of
+        these unless ``matrix`` is that of some.
         """
-        matrix = self.exact if exact else self.matrix
+        matrix = self.matrix if matrix is None else matrix
         mean, sd = predict(matrix, parameters)
         offset = self.model.offset + bent(self.readings, self.vectors, self.model, parameters)
         return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
@@ -236,70 +225,46 @@ class _Update:
 
 @dataclass
 class _Search:
-    """Updates, each about what the last one found, until the terms of the instruments are at rest.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    session : Session
-    similar : Magnet or None
-        See `infer`.
-    of_blocks : MeasuredPrior or None
-        Prior from a table of measured blocks.
-    prior : Gaussian or None
-        Prior of the blocks' parameters that replaces it and that of the study.
-    terms : OpenTerms
-        Terms of the instruments that are estimated.
-    amplitudes : tuple of Uncertain
-        What else is uncertain of the instruments.
-    maps : sequence of Map
-        With the instruments as they are estimated.
-    total : ndarray, shape (terms,)
-        Change of the open terms since the study.
-    at : _Estimate or None
-        The magnet as it is estimated; None if all terms are known.
-    nominal_field : callable or None
-        Field of the nominal magnet, if ``amplitudes`` act on it.
-    magnitudes : Magnitudes
-        The field about which readings of |B| are linear.
-    noises : dict
-        Noise of each map, computed once for one magnet.
-    noise_blocks : tuple of MagnetBlock or None
-        In whose gradient uncertain positions make the noise; None for the nominal ones.
-    solved : _Solved or None
-        The last response that was solved for.
-    error, shared_error : ndarray or None, in T
-        Of the solver in each reading, and in all together, see `Response`.
-    place : _Place or None
-        What the last update that was not worse has found.
-    share : float
-        Part of the last change of the terms that was taken.
-    level : int
-        Number of updates since the last that was better by more than `NO_WORSE`, but for those that
-        were worse.
-    last : _Update
-    """
+    """Updates, each about what the last one found, until the instruments are at rest."""
 
     magnet: Magnet
     session: Session
     similar: Magnet | None
+    """See `infer`."""
     of_blocks: MeasuredPrior | None
+    """Prior from a table of measured blocks."""
     prior: Gaussian | None
+    """Prior of the blocks' parameters that replaces it and that of the study."""
     terms: OpenTerms
+    """Terms of the instruments that are estimated."""
     amplitudes: tuple[Uncertain, ...]
+    """What else is uncertain of the instruments."""
     maps: Sequence[Map]
+    """With the instruments as they are estimated."""
     total: Floats
+    """Change of the open terms since the study. Shape (terms,)."""
     at: _Estimate | None
+    """The magnet as it is estimated; None if all terms are known."""
     nominal_field: Callable[[Floats], Floats] | None
+    """Field of the nominal magnet, if ``amplitudes`` act on it."""
     magnitudes: Magnitudes = field(default_factory=Magnitudes)
+    """The field about which readings of |B| are linear."""
     noises: Noises = field(default_factory=dict)
+    """Noise of each map, computed once for one magnet."""
     noise_blocks: tuple[MagnetBlock, ...] | None = None
+    """In whose gradient uncertain positions make the noise; None for the nominal ones."""
     solved: _Solved | None = None
+    """The last response that was solved for."""
     error: Floats | None = None
     shared_error: Floats | None = None
+    """Of the solver in each reading, and in all together, see `Response`. In T."""
     place: _Place | None = None
+    """What the last update that was not worse has found."""
     share: float = 1.0
+    """Part of the last change of the terms that was taken."""
     level: int = 0
+    """Number of updates since the last that was better by more than `NO_WORSE`, but for those that
+    were worse."""
     last: _Update = field(init=False)
 
     @classmethod
@@ -379,15 +344,16 @@ class _Search:
         if self.error is None:  # one for all updates: they are compared by their probabilities
             self.error, self.shared_error = model.error, _seen(model.shared_error.T, readings)
         matrix: Rows = model.matrix
-        exact, prior = matrix, self._prior_of_blocks(len(model.parameters))
-        for columns, mean, sd in self._beside(readings):
+        exact, of_field, prior = matrix, matrix, self._prior_of_blocks(len(model.parameters))
+        for of, columns, mean, sd in self._beside(readings):
             matrix, prior = Beside(matrix, columns), joined(prior, mean, sd)
-            exact = Beside(exact, 0 * columns if columns is self.shared_error else columns)
+            exact = Beside(exact, 0 * columns if of == "solver" else columns)
+            of_field = Beside(of_field, 0 * columns if of == "instrument" else columns)
         magnitudes = self.magnitudes.about(readings, vectors, model, prior)
         errors = magnitudes.with_bend(readings.noise).with_independent_errors(self.error)
         residual, training = readings.values - model.offset, readings.training
         return _Update(
-            readings, vectors, model, matrix, exact, prior, residual, errors, magnitudes,
+            readings, vectors, model, matrix, exact, of_field, prior, residual, errors, magnitudes,
             linear_gaussian.update(matrix, residual[training], errors.subset(training), prior,
                                    np.flatnonzero(training)))
 
@@ -399,8 +365,11 @@ class _Search:
         return study_prior(self.magnet, others) if self.of_blocks is None else with_others(
             self.of_blocks.gaussian, self.magnet, others)
 
-    def _beside(self, readings: Readings) -> Iterator[tuple[Floats, Floats, Floats]]:
-        """Yield derivatives, prior mean and prior standard deviations of what is beside blocks.
+    def _beside(
+        self, readings: Readings
+    ) -> Iterator[tuple[Literal["instrument", "neighbours", "solver"], Floats, Floats, Floats]]:
+        """Yield of what it is, derivatives, prior mean and prior standard deviations of what is
+        beside blocks.
 
         The solver's error is shared by all readings: it may be any multiple of the change that
         another discretization makes, normally distributed about 0. As noise that is independent
@@ -410,13 +379,15 @@ class _Search:
             columns = amplitude_columns(
                 with_instruments(self.magnet.study, self.maps),
                 self.nominal_field if self.at is None else self.at.field, self.maps, readings)
-            yield columns, np.zeros(len(self.amplitudes)), np.ones(len(self.amplitudes))
-        for each in (_neighbour_columns(self.magnet, self.maps, readings), self.shared_error):
-            if each is not None and each.size:
-                yield each, np.zeros(each.shape[1]), np.ones(each.shape[1])
+            yield "instrument", columns, *_unit_prior(columns)
+        neighbours = neighbour_columns(self.magnet, self.maps, readings)
+        if neighbours.size:
+            yield "neighbours", neighbours, *_unit_prior(neighbours)
+        if self.shared_error is not None and self.shared_error.size:
+            yield "solver", self.shared_error, *_unit_prior(self.shared_error)
         if self.at is not None:
-            yield (self.terms.columns(self.at.field, self.maps, readings), -self.total,
-                   self.terms.sd)
+            yield ("instrument", self.terms.columns(self.at.field, self.maps, readings),
+                   -self.total, self.terms.sd)
 
     def _sd_of_terms(self) -> Floats:
         """Return the posterior standard deviations of the open terms, as they are counted."""
@@ -454,8 +425,10 @@ class _Search:
             regions=readings.regions, maps=readings.maps, response=last.model,
             prior=prior, posterior=posterior, prediction_prior=before,
             prediction_posterior=last.predicted(whole),
-            prediction_exact=last.predicted(last.prior, exact=True)
+            prediction_exact=last.predicted(last.prior, last.exact)
             if last.model.shared_error.any() else before,
+            prediction_field=last.predicted(whole, last.of_field)
+            if len(self.terms) or self.amplitudes else None,
             prior_conflict=last.update.prior_conflict,
             parameters_learnt=last.update.parameters_learnt,
             log_evidence=last.update.log_evidence,
@@ -474,7 +447,12 @@ class _Search:
             noise_blocks=self.noise_blocks)
 
 
-def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+def _unit_prior(columns: Floats) -> tuple[Floats, Floats]:
+    """Return mean and standard deviations of what columns (n, k) are per standard deviation of."""
+    return np.zeros(columns.shape[1]), np.ones(columns.shape[1])
+
+
+def neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
     """Return readings (n, k) in T of neighbours' blocks that deviate by a standard deviation."""
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))
@@ -549,30 +527,20 @@ class _Estimate:
 
 @dataclass(frozen=True)
 class _Place:
-    """Terms of the instruments about which an update was made, and what it found.
-
-    Attributes
-    ----------
-    maps : sequence of Map
-        With instruments of these terms.
-    total : ndarray, shape (terms,)
-        Their change since the study.
-    estimate : _Estimate
-        The magnet about which the update was made.
-    change : ndarray, shape (terms,)
-        Of the terms, that the update found.
-    deviations : ndarray, shape (parameters,)
-        Of the blocks, that the update found.
-    log_posterior : float
-        Log posterior density of the terms about which the update was made, but for a constant.
-    """
+    """Terms of the instruments about which an update was made, and what it found."""
 
     maps: Sequence[Map]
+    """With instruments of these terms."""
     total: Floats
+    """Their change since the study. Shape (terms,)."""
     estimate: _Estimate
+    """The magnet about which the update was made."""
     change: Floats
+    """Of the terms, that the update found. Shape (terms,)."""
     deviations: Floats
+    """Of the blocks, that the update found. Shape (parameters,)."""
     log_posterior: float
+    """Log posterior density of the terms about which the update was made, but for a constant."""
 
     def moved(
         self, open_terms: OpenTerms, share: float

@@ -53,25 +53,17 @@ from halbach_fe.study.uncertain import shifted
 
 @dataclass(frozen=True)
 class OpenTerms:
-    """The terms of the instruments of some maps that are not known exactly.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of each term, after the name of its map, stage or probe: ``fringe.translation_x_m``.
-    sd : ndarray, shape (terms,)
-        Prior standard deviations.
-    effects : tuple of ndarray, shape (30, terms)
-        For each map, how the open terms change the terms of its instrument (see `NAMES`). Maps of
-        one probe or stage share open terms.
-    shifts : tuple of ndarray, shape (3, terms)
-        For each map, how the open terms shift it along the axes of its stage.
-    """
+    """The terms of the instruments of some maps that are not known exactly."""
 
     names: tuple[str, ...]
+    """Of each term, after the name of its map, stage or probe: ``fringe.translation_x_m``."""
     sd: Floats
+    """Prior standard deviations. Shape (terms,)."""
     effects: tuple[Floats, ...]
+    """For each map, how the open terms change the terms of its instrument (see `NAMES`). Maps of
+    one probe or stage share open terms. Shape (30, terms)."""
     shifts: tuple[Floats, ...]
+    """For each map, how the open terms shift it along the axes of its stage. Shape (3, terms)."""
 
     @classmethod
     def of(cls, maps: Sequence[Map]) -> OpenTerms:
@@ -216,8 +208,6 @@ def amplitude_columns(
         With the instruments as they are estimated.
     field : callable
         See `OpenTerms.columns`.
-    maps : sequence of Map
-    readings : Readings
     """
     # Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
     # laws are linear to 1e-6 over it.
@@ -229,26 +219,29 @@ def amplitude_columns(
     for number, one in enumerate(maps):
         data = in_si_and_magnet_axes(one.study.instrument, one.data)
         points = points_of(data)
-        if one.is_validation:
-            found.append(np.zeros((len(uncertain), len(points), 3)))
-            continue
         before = sensor_positions(one.study.instrument, points)
         at_sensors, gradient = field_at_sensors(field, before)
 
         def off(other: Study, number: int = number, data: xr.Dataset = data,
                 points: Floats = points, before: Floats = before,
                 at_sensors: Floats = at_sensors, gradient: Floats = gradient,
-                name: str = one.name) -> Floats:
+                name: str = one.name, listed: bool = not one.is_validation) -> Floats:
             """Return what the sensors show, less the values that are read."""
-            own = other.of_map(number).instrument if other.maps else other.instrument
+            own = (other.of_map(number).instrument if other.maps and listed
+                   else other.instrument)  # which a held-out map has
             away = sensor_positions(own, points) - before
             shown = seen(sensor_matrix(own), at_sensors + np.einsum(
                 "nscj,nsj->nsc", gradient, away))
-            if not is_total_field(data):
-                return shown - np.nan_to_num(remove_nonlinear_part(own, data))
-            along = readings.directions[name]
-            return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
-                total_without_nonlinear_part(own, data)))[:, None]
+            try:
+                if not is_total_field(data):
+                    return shown - np.nan_to_num(remove_nonlinear_part(own, data))
+                along = readings.directions[name]
+                return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
+                    total_without_nonlinear_part(own, data)))[:, None]
+            except MeasurementError:
+                if listed:
+                    raise
+                return 0 * shown  # what a probe of such a held-out map cannot have
 
         found.append(np.array([(off(more) - off(less)) / (2 * amplitude_step)
                                for more, less in sides]).reshape(-1, len(points), 3))

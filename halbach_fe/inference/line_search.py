@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, spread
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_space import Shown, misfit_of, right_angles, same_pose
@@ -59,7 +59,6 @@ def poses_along(
 
     Parameters
     ----------
-    magnet : Magnet
     points, readings : ndarray, shape (n, 3)
         In m and T; the middle of the points is at the origin.
     training : ndarray of bool, shape (n, 3)
@@ -68,13 +67,10 @@ def poses_along(
         Of the line, in the map's coordinates.
     across_m : float
         Prior standard deviation of the line's distance from the axis along x and y.
-    pace : Pace
     """
     most_starts = 12  # largest number of candidates that are improved
-    rows = np.flatnonzero(training.any(axis=1))
-    # number of readings that are used
-    most_readings = 40
-    rows = rows[np.linspace(0, len(rows) - 1, min(most_readings, len(rows))).astype(int)]
+    most_readings = 40  # number of readings that are used
+    rows = spread(np.flatnonzero(training.any(axis=1)), most_readings)
     points, used, seen = points[rows], np.where(training, readings, 0.0)[rows], training[rows]
     starts = _transverse_starts(magnet, across_m)
     table = _Table.of(magnet, vacuum, starts, float(np.ptp(points @ direction)))

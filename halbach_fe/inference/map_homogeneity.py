@@ -4,9 +4,10 @@ In the sphere about the region's centre that blocks and iron leave free, the fie
 gradients of solid harmonics. Their amplitudes have a normal prior, of the same width on that sphere
 for all, which the evidence of the readings chooses; the uniform field is as good as free. With the
 covariance that the noise of the readings leaves they give the field in a region within the map.
-Terms of the instruments of which the study states a standard deviation are parameters beside them:
-a map by itself does not tell a probe's gain from the field. Beside the field of the nominal and of
-the updated magnet that of the map shows how much the update explains.
+Terms of the instruments of which the study states a standard deviation, and uncertain amplitudes of
+instruments, are parameters beside them: a map by itself does not tell a probe's gain from the
+field. Beside the field of the nominal and of the updated magnet that of the map shows how much the
+update explains.
 
 Of a map that lacks components the uniform field along these is unknown, and with it |B|. If the
 main field is along components that it has, the size of these is |B| to first order, and is what is
@@ -31,7 +32,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.instrument_fit import OpenTerms
+from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns
 from halbach_fe.inference.readings import (
     Readings,
     read_campaign,
@@ -47,6 +48,7 @@ from halbach_fe.measurement.harmonic_field import (
     solid_harmonic_fields,
 )
 from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel, sphere_points
+from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 WITHIN = 0.75
@@ -113,7 +115,8 @@ def map_homogeneity(
     found, noises, remarks = {}, {}, []
     for name, chosen in parts.items():
         what = "The map" if name == MAP else "Its held-out part"
-        known, noises[name], remark = _fitted(readings, chosen, model, free, seed, maps)
+        known, noises[name], remark = _fitted(
+            readings, chosen, model, free, seed, maps, magnet.study)
         if known is not None:
             found[name] = known
         if remark and (name == MAP or known is None):
@@ -179,7 +182,7 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
 
 def _fitted(
     readings: Readings, chosen: NDArray[np.bool_], model: HomogeneityModel, free_m: float,
-    seed: int, maps: Sequence[Map],
+    seed: int, maps: Sequence[Map], study: Study,
 ) -> tuple[Homogeneity | None, float, str]:
     """Return the homogeneity of the fit of some readings, and its noise over the stated noise.
 
@@ -204,8 +207,8 @@ def _fitted(
         (observation.points[seen] - centre) / free_m)) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
-    terms = _terms(readings, maps, lambda at: (_fields((at - centre) / free_m)
-                                               @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
+    terms = _terms(study, readings, maps, lambda at: (
+        _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
     mean, noise, root = _with_terms(design, terms, scaled, fit)
     normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
     every = np.column_stack([mean, mean[:, None] + root @ normals])
@@ -286,13 +289,17 @@ def _open(drawn: Floats, direction: Floats, weights: Floats) -> float:
 
 
 def _terms(
-    readings: Readings, maps: Sequence[Map], field: Callable[[Floats], Floats]
+    study: Study, readings: Readings, maps: Sequence[Map], field: Callable[[Floats], Floats]
 ) -> Floats:
-    """Return the readings (n, terms) in T per prior sd of what is open about the instruments."""
-    opened = OpenTerms.of(maps)
-    if not len(opened):
-        return np.zeros((len(readings.values), 0))
-    return opened.columns(field, maps, readings) * opened.sd
+    """Return the readings (n, terms) in T per prior sd of what is open about the instruments: their
+    terms, and amplitudes of the study.
+    """
+    opened, found = OpenTerms.of(maps), [np.zeros((len(readings.values), 0))]
+    if len(opened):
+        found.append(opened.columns(field, maps, readings) * opened.sd)
+    if any(one.is_of_instrument for one in study.uncertain):
+        found.append(amplitude_columns(study, field, maps, readings))
+    return np.hstack(found)
 
 
 def _with_terms(

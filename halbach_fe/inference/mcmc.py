@@ -60,33 +60,23 @@ Map = Callable[..., Iterable[Any]]
 
 @dataclass(frozen=True)
 class SampledPosterior:
-    """Draws of the posterior, with diagnostics of their quality.
-
-    Attributes
-    ----------
-    draws : ndarray, shape (chains, draws, parameters), in A/m
-    parameters : tuple of str
-        Names of the parameters.
-    accepted : float
-        Fraction of the proposals that were accepted.
-    solves : int
-        Number of likelihoods that the chains and the search for the mode evaluated, including those
-        of interrupted runs.
-    agreement_T : float
-        Largest difference from GetDP's Newton method in any reading, of magnetizations drawn from
-        the prior and from the posterior.
-    diagnostics : ConvergenceDiagnostics
-    prediction : Prediction
-        Prediction of all readings, including the held-out ones.
-    """
+    """Draws of the posterior, with diagnostics of their quality."""
 
     draws: Floats
+    """Shape (chains, draws, parameters), in A/m."""
     parameters: tuple[str, ...]
+    """Names of the parameters."""
     accepted: float
+    """Fraction of the proposals that were accepted."""
     solves: int
+    """Number of likelihoods that the chains and the search for the mode evaluated, including those
+    of interrupted runs."""
     agreement_T: float
+    """Largest difference from GetDP's Newton method in any reading, of magnetizations drawn from
+    the prior and from the posterior."""
     diagnostics: ConvergenceDiagnostics
     prediction: Prediction
+    """Prediction of all readings, including the held-out ones."""
 
     @property
     def mean(self) -> Floats:
@@ -125,10 +115,6 @@ def sample_posterior(
     mapped : callable
         Calls a function for every chain, like `map`. The method ``map`` of an executor runs the
         chains in parallel, with the same result.
-
-    Returns
-    -------
-    SampledPosterior
 
     Raises
     ------
@@ -225,10 +211,7 @@ def _assessed(
 
     Parameters that are not ``free`` (m,), those of missing blocks, are known exactly.
 
-    Raises
-    ------
-    SamplingError
-        If the free parameters have not converged.
+    SamplingError if the free parameters have not converged.
     """
     found = assess_convergence(samples[:, :, free])
     require_convergence(found, [name for name, one in zip(names, free, strict=True) if one],
@@ -270,22 +253,15 @@ def _advance(
 
 @dataclass
 class _Run:
-    """The state of a chain between two chunks.
-
-    Attributes
-    ----------
-    generator : numpy.random.Generator
-    last : ndarray
-        Last point of the chain, in the whitened coordinates of `Chain`.
-    samples : ndarray, shape (draws, parameters), in A/m
-    accepted : float
-        Fraction of the proposals that were accepted so far.
-    """
+    """The state of a chain between two chunks."""
 
     generator: np.random.Generator
     last: Floats
+    """Last point of the chain, in the whitened coordinates of `Chain`."""
     samples: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    """Shape (draws, parameters), in A/m."""
     accepted: float = 0.0
+    """Fraction of the proposals that were accepted so far."""
 
     def append(self, chain: Chain, generator: np.random.Generator) -> None:
         """Append the steps of a chain, and keep the generator in the state after them."""
@@ -406,4 +382,4 @@ def with_samples(update: InferenceResult, sampled: SampledPosterior) -> Inferenc
     from_samples = replace(update.posterior, mean=sampled.mean,
                            root=vectors * np.sqrt(np.maximum(values, 0)))
     return replace(update, kind="samples", posterior=from_samples,
-                   prediction_posterior=sampled.prediction)
+                   prediction_posterior=sampled.prediction, prediction_field=None)

@@ -53,7 +53,6 @@ def overlaps(
         Noise of the readings and error of the solver.
     prior : Gaussian
         Of all parameters.
-    readings : Readings
     """
     maps, training = np.array(readings.maps), readings.training
     held_out = np.array(readings.parts) == HELD_OUT

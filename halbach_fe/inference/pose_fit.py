@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle, spread
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
@@ -36,7 +37,6 @@ from halbach_fe.inference.pose_space import (
     share_of,
 )
 from halbach_fe.inference.readings import unit_vectors
-from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.doubted_terms import (
     UNITS,
     Term,
@@ -134,57 +134,43 @@ PART_OF_SD = 0.1
 
 @dataclass(frozen=True)
 class PoseFit:
-    """What the fits of all poses share.
-
-    Attributes
-    ----------
-    points, readings : ndarray, shape (n, 3)
-        The map in m and T, by the study's units and axes.
-    training, held_out : ndarray of bool, shape (n, 3)
-    sigma : ndarray, shape (n, 3), in T
-        Noise of the readings, without that of positions; 1 T for those that are not used.
-    position_sd : ndarray, shape (3,), in m
-    base : Instrument
-        The study's instrument without its pose.
-    prior : Gaussian
-        Of all parameters of the blocks.
-    total : bool
-        Whether the map is of |B|, which stands in place of Bx. The probe then has one gain and one
-        offset, which are those of x, and no other terms.
-    pose_sd : ndarray, shape (6,)
-        Prior standard deviations of the pose in m and rad.
-    on_known_stage : bool
-        Whether these are about the pose from which a fit starts.
-    is_part : bool
-        Whether these are some of the map's readings only.
-    derivatives : dict
-        Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
-    solved : dict
-        The last fields that were solved for, by the values of the open keys.
-    built : dict
-        The last magnets that were built, by the values of the open keys.
-    """
+    """What the fits of all poses share."""
 
     magnet: Magnet
     points: Floats
     readings: Floats
+    """The map in m and T, by the study's units and axes. Shape (n, 3)."""
     training: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
+    """Shape (n, 3)."""
     sigma: Floats
+    """Noise of the readings, without that of positions; 1 T for those that are not used.
+    Shape (n, 3), in T."""
     position_sd: Floats
+    """Shape (3,), in m."""
     session: Session
     probe: ProbePrior
     base: Instrument
+    """The study's instrument without its pose."""
     open: tuple[OpenKey, ...]
     pose_sd: Floats
+    """Prior standard deviations of the pose in m and rad. Shape (6,)."""
     on_known_stage: bool
+    """Whether these are about the pose from which a fit starts."""
     deviations: Deviations
     prior: Gaussian
+    """Of all parameters of the blocks."""
     total: bool = False
+    """Whether the map is of |B|, which stands in place of Bx. The probe then has one gain and one
+    offset, which are those of x, and no other terms."""
     is_part: bool = False
+    """Whether these are some of the map's readings only."""
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
+    """Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`."""
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
+    """The last fields that were solved for, by the values of the open keys."""
     built: dict[bytes, Magnet] = dataclasses.field(default_factory=dict, repr=False)
+    """The last magnets that were built, by the values of the open keys."""
 
     @classmethod
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
@@ -280,7 +266,7 @@ class PoseFit:
 
     def _origin(self, base: Instrument) -> Floats:
         """Return the middle (3,) in m of the map, in the scale of an instrument without pose."""
-        return middle_of(sensor_positions(base.with_(
+        return box_middle(sensor_positions(base.with_(
             sensor_position_m=((0.0, 0.0, 0.0),) * 3), self.points)[:, 0])
 
     def _base(self, values: Floats) -> Instrument:
@@ -359,8 +345,7 @@ class PoseFit:
         few_points = 400
         if len(self.points) < 2 * few_points or self.on_a_line:
             return None
-        rows = np.flatnonzero(self.training.any(axis=1))
-        some = rows[np.linspace(0, len(rows) - 1, min(few_points, len(rows))).astype(int)]
+        some = spread(np.flatnonzero(self.training.any(axis=1)), few_points)
         some = np.unique(np.concatenate([some, self.points.argmin(axis=0),
                                          self.points.argmax(axis=0)]))
         chosen: dict[str, Any] = {name: getattr(self, name)[some] for name in (
@@ -625,12 +610,12 @@ class PoseFit:
         matrix = sensor_matrix(instrument)
         here, gradient = field_at_sensors(self._field(values), sensors)
         nominal = seen(matrix, here) + near.shift @ matrix.T
-        at_mean = gradient.mean(axis=1)
+        at_mean, stage = gradient.mean(axis=1), rotation_matrix(instrument.rotation_rad)
         of_blocks = np.einsum("ij,njk->nik", matrix, near.fields)
 
         def about(along: Floats) -> tuple[Floats, Floats, Floats]:
             """Return residual, derivatives by blocks and noise about directions of the field."""
-            moved = self._shown(np.einsum("ij,njk->nik", matrix, at_mean), along)
+            moved = self._shown(matrix @ at_mean @ stage, along)
             return (self.readings - self._shown(nominal, along) - values[OFFSETS],
                     self._shown(of_blocks, along),
                     np.sqrt(self.sigma**2 + np.sum((moved * self.position_sd)**2, axis=2)))
@@ -671,23 +656,17 @@ class PoseFit:
 
 @dataclass(frozen=True)
 class _BlockColumns:
-    """Fields of the blocks at the places of a map.
-
-    Attributes
-    ----------
-    places : ndarray, shape (n, 3), in m
-    fields : ndarray, shape (n, 3, k), in T
-        B per prior standard deviation of k combinations of the magnetizations.
-    shift : ndarray, shape (n, 3), in T
-        B of the prior's mean less that of the nominal magnet.
-    directions : ndarray, shape (columns of the prior's root, k)
-        The combinations.
-    """
+    """Fields of the blocks at the places of a map."""
 
     places: Floats
+    """Shape (n, 3), in m."""
     fields: Floats
+    """B per prior standard deviation of k combinations of the magnetizations.
+    Shape (n, 3, k), in T."""
     shift: Floats
+    """B of the prior's mean less that of the nominal magnet. Shape (n, 3), in T."""
     directions: Floats
+    """The combinations. Shape (columns of the prior's root, k)."""
 
 
 class _Place(NamedTuple):
@@ -701,31 +680,22 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True)
 class _State:
-    """Readings and their derivatives at one pose and instrument.
-
-    Attributes
-    ----------
-    residual : ndarray, shape (n, 3), in T
-        Of the nominal blocks.
-    by_parameter : ndarray, shape (n, 3, p)
-        Derivatives by shifts, turns, and the other parameters.
-    by_block : ndarray, shape (n, 3, k), in T
-        Readings per prior standard deviation of the magnetizations.
-    sigma : ndarray, shape (n, 3), in T
-    prior_sd : ndarray, shape (p,)
-    reach : float, in m
-        Largest shift for which ``by_block`` holds, see `DEVIATION`.
-    noise : ndarray, shape (n, 3), in T, optional
-        Taken instead of ``sigma``, see `with_noise`.
-    """
+    """Readings and their derivatives at one pose and instrument."""
 
     residual: Floats
+    """Of the nominal blocks. Shape (n, 3), in T."""
     by_parameter: Floats
+    """Derivatives by shifts, turns, and the other parameters. Shape (n, 3, p)."""
     by_block: Floats
+    """Readings per prior standard deviation of the magnetizations. Shape (n, 3, k), in T."""
     sigma: Floats
+    """Shape (n, 3), in T."""
     prior_sd: Floats
+    """Shape (p,)."""
     reach: float
+    """Largest shift for which ``by_block`` holds, see `DEVIATION`. In m."""
     noise: Floats | None = None
+    """Taken instead of ``sigma``, see `with_noise`. Shape (n, 3), in T."""
 
     def with_noise(self, noise: Floats | None) -> _State:
         """Return the state with another noise (n, 3) in T, or with its own if there is none."""

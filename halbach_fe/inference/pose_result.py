@@ -33,22 +33,14 @@ noise that the study takes for 1.7 times too small does not pass it."""
 
 @dataclass(frozen=True)
 class ProbePrior:
-    """Prior standard deviations of the instrument, apart from its pose.
-
-    Attributes
-    ----------
-    crosstalk : float
-        Of the probe's axes against those of the stage.
-    gain : float
-    offset_T : float
-    sensor_m : float
-        Of a sensor's place along each axis.
-    """
+    """Prior standard deviations of the instrument, apart from its pose."""
 
     crosstalk: float = 0.03
+    """Of the probe's axes against those of the stage."""
     gain: float = 0.003
     offset_T: float = 1e-3
     sensor_m: float = 1e-4
+    """Of a sensor's place along each axis."""
 
     @classmethod
     def of(cls, known: InstrumentSd) -> ProbePrior:
@@ -95,28 +87,19 @@ which then count twice, narrow an error bar by no more than 1 in 200."""
 
 @dataclass(frozen=True)
 class StagePose:
-    """Where a map lies by another map on the same stage, but for shifts along the stage's axes.
-
-    Attributes
-    ----------
-    turn : Rotation
-        From the map's axes to those of the magnet.
-    middle_m : ndarray, shape (3,)
-        Where its middle lies without a shift.
-    axes : ndarray, shape (3, 3)
-        Axes of the stage in the magnet, in columns.
-    shift_sd_m : ndarray, shape (3,)
-        Prior standard deviations of the shifts along them.
-    middle_sd_m, turn_sd_rad : ndarray, shape (3,)
-        What the other map leaves open, along and about the magnet's axes.
-    """
+    """Where a map lies by another map on the same stage, but for shifts along the stage's axes."""
 
     turn: Rotation
+    """From the map's axes to those of the magnet."""
     middle_m: Floats
+    """Where its middle lies without a shift. Shape (3,)."""
     axes: Floats
+    """Axes of the stage in the magnet, in columns. Shape (3, 3)."""
     shift_sd_m: Floats
+    """Prior standard deviations of the shifts along them. Shape (3,)."""
     middle_sd_m: Floats
     turn_sd_rad: Floats
+    """What the other map leaves open, along and about the magnet's axes. Shape (3,)."""
 
     def sd(self, magnet: Magnet) -> Floats:
         """Return the standard deviations (6,) of shifts in m and turns in rad."""
@@ -132,22 +115,15 @@ class StagePose:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Prior standard deviations of the pose, which matter where the map does not determine it.
-
-    Attributes
-    ----------
-    across_m : float, optional
-        Of the middle of the map from the magnet's axis along x and y; by default the outer radius
-        of the blocks.
-    turn_rad : float
-        Of the turns about the magnet's axes from the nearest rotation by right angles.
-    stage : StagePose, optional
-        What another map on the same stage says, which replaces the above.
-    """
+    """Prior standard deviations of the pose, which matter where the map does not determine it."""
 
     across_m: float | None = None
+    """Of the middle of the map from the magnet's axis along x and y; by default the outer radius of
+    the blocks."""
     turn_rad: float = 0.1
+    """Of the turns about the magnet's axes from the nearest rotation by right angles."""
     stage: StagePose | None = None
+    """What another map on the same stage says, which replaces the above."""
 
     def sd(self, magnet: Magnet) -> Floats:
         """Return the standard deviations (6,) of shifts in m and turns in rad.
@@ -162,18 +138,12 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class OpenKey:
-    """A number of the study that a drawing leaves open, to be fitted with the pose.
-
-    Attributes
-    ----------
-    key : str
-        Such as ``demagnetization.squareness``, or ``instrument.z_scale`` for the step of the map.
-    sd : float
-        Prior standard deviation about the value in the study.
-    """
+    """A number of the study that a drawing leaves open, to be fitted with the pose."""
 
     key: str
+    """Such as ``demagnetization.squareness``, or ``instrument.z_scale`` for the step of the map."""
     sd: float
+    """Prior standard deviation about the value in the study."""
 
     def value(self, study: Study) -> float:
         """Return the number in a study.
@@ -228,7 +198,7 @@ class Registration:
     instrument : Instrument
         The pose, axes, gains, offsets and sensors that were found.
     middle_m : ndarray, shape (3,)
-        Where the middle of the map lies in the magnet, see `middle_of`.
+        Where the middle of the box around the map's points lies in the magnet.
     translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
         Standard deviations of that place, and of the turns about the magnet's axes.
     prior_sd : ndarray, shape (6,)

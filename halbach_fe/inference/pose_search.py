@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, box_middle, spread
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
@@ -25,7 +25,6 @@ from halbach_fe.inference.pose_space import (
     same_pose,
     share_of,
 )
-from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.field_map import UNDIRECTED_COLUMN
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
@@ -67,11 +66,10 @@ def coarse_poses(
 ) -> list[Floats]:
     """Return poses (6,), the best first: where the map's middle lies in m, and a rotation vector.
 
-    The middle is that of `middle_of`, so that a turn does not move the map.
+    The middle is that of `box_middle`, so that a turn does not move the map.
 
     Parameters
     ----------
-    magnet : Magnet
     points, readings : ndarray, shape (n, 3)
         In m and T; NaN for components that were not measured.
     training : ndarray of bool, shape (n, 3)
@@ -94,7 +92,7 @@ def coarse_poses(
     used = np.where(training, readings, 0.0)
     if not len(rows) or not used.any():
         raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
-    points = points - middle_of(points)
+    points = points - box_middle(points)
     line = line_of(points[rows], NARROW * magnet.bore_radius)
     pace = pace or Pace(lambda _: None)
     vacuum = Shown(field_in_vacuum(magnet.blocks), total)
@@ -159,8 +157,7 @@ def _searched(
 
 def _chosen(training: NDArray[np.bool_], count: int) -> Ints:
     """Return at most so many rows throughout the scan that have readings."""
-    rows = np.flatnonzero(training.any(axis=1))
-    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
+    return spread(np.flatnonzero(training.any(axis=1)), count)
 
 
 def _scores(

@@ -60,30 +60,21 @@ Noises = dict[str, NoiseCovariance]
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of some maps, one map after the other.
-
-    Attributes
-    ----------
-    observation : Observation
-    values : ndarray, shape (readings,), in T
-    noise : NoiseCovariance
-    parts, regions, maps : tuple of str
-        Part (`TRAINING`, `HELD_OUT` or `HELD_OUT_MAP`), noise region and map of each reading.
-    vectors : Observation
-        The same with all components of B in place of each reading of |B|.
-    directions : dict of str to ndarray, shape (n, 3)
-        For each map of |B| the unit vectors of the field about which |B| is linearized, as a probe
-        of three components would show them.
-    """
+    """The readings of some maps, one map after the other."""
 
     observation: Observation
     values: Floats
+    """Shape (readings,), in T."""
     noise: NoiseCovariance
     parts: tuple[str, ...]
     regions: tuple[str, ...]
     maps: tuple[str, ...]
+    """Part (`TRAINING`, `HELD_OUT` or `HELD_OUT_MAP`), noise region and map of each reading."""
     vectors: Observation
+    """The same with all components of B in place of each reading of |B|."""
     directions: dict[str, Floats] = field(default_factory=dict)
+    """For each map of |B| the unit vectors of the field about which |B| is linearized, as a probe
+    of three components would show them. Shape (n, 3)."""
 
     @cached_property
     def total(self) -> NDArray[np.bool_]:
@@ -147,8 +138,6 @@ def read_campaign(
 
     Parameters
     ----------
-    magnet : Magnet
-    maps : sequence of Map
     known : dict, optional
         Noise of the same maps with little other poses, which is not computed again; what is
         computed is added.

@@ -44,7 +44,7 @@ from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import contraction, predict, row_slices, whitened
+from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import shifted
@@ -85,22 +85,16 @@ WELL_KNOWN = 2.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """The distribution of the readings that a model predicts, without their noise.
-
-    Attributes
-    ----------
-    mean, sd : ndarray, shape (readings,), in T
-    root : callable
-        Returns the rows (c, columns), in T, of a root of the covariance for indices (c,) of
-        readings.
-    columns : int
-        Number of columns of the root.
-    """
+    """The distribution of the readings that a model predicts, without their noise."""
 
     mean: Floats
     sd: Floats
+    """Shape (readings,), in T."""
     root: Callable[[Ints], Floats]
+    """Returns the rows (c, columns), in T, of a root of the covariance for indices (c,) of
+    readings."""
     columns: int
+    """Number of columns of the root."""
 
 
 @dataclass(frozen=True)
@@ -109,23 +103,19 @@ class SensedField:
 
     A reading is known as well as its noise. The field is not, if gain, crosstalk or pose are
     uncertain: what the instrument may be wrong by, the magnet may have.
-
-    Attributes
-    ----------
-    places : ndarray, shape (readings, 3), in m
-        In the magnet, as the instrument is estimated. The field is that of these fixed places.
-    along : ndarray, shape (readings, 3)
-        Unit vectors in the magnet's axes, along which the sensors read: x, y or z, but for turns
-        and crosstalk.
-    mean, sd : ndarray, shape (readings,), in T
-        The component of B along these, and its standard deviation by blocks and solver. ``along``,
-        ``mean`` and ``sd`` are NaN for Fourier coefficients, which are sums over circles.
     """
 
     places: Floats
+    """In the magnet, as the instrument is estimated. The field is that of these fixed places.
+    Shape (readings, 3), in m."""
     along: Floats
+    """Unit vectors in the magnet's axes, along which the sensors read: x, y or z, but for turns and
+    crosstalk. Shape (readings, 3)."""
     mean: Floats
     sd: Floats
+    """The component of B along these, and its standard deviation by blocks and solver. ``along``,
+    ``mean`` and ``sd`` are NaN for Fourier coefficients, which are sums over circles.
+    Shape (readings,), in T."""
 
     @property
     def strongest(self) -> int | None:
@@ -142,91 +132,62 @@ class SensedField:
 
 @dataclass(frozen=True)
 class MapPose:
-    """Where a map lies in the magnet, as the update found it.
-
-    Attributes
-    ----------
-    name : str
-        Of the map.
-    middle_m, middle_sd_m : tuple of float
-        Middle of its points in the magnet's axes, and the standard deviations.
-    turn_sd_rad : tuple of float
-        Standard deviations of its turn about each axis of the magnet.
-    """
+    """Where a map lies in the magnet, as the update found it."""
 
     name: str
+    """Of the map."""
     middle_m: tuple[float, float, float]
     middle_sd_m: tuple[float, float, float]
+    """Middle of its points in the magnet's axes, and the standard deviations."""
     turn_sd_rad: tuple[float, float, float]
+    """Standard deviations of its turn about each axis of the magnet."""
 
 
 @dataclass(frozen=True)
 class InstrumentTerms:
-    """Terms of the instruments that were estimated together with the magnetizations.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Such as ``fringe.translation_x_m``, after the name of a map, a stage or a probe.
-    change, sd, prior_sd : ndarray, shape (terms,)
-        Change from what the study says, and standard deviations after and before.
-    at_rest : bool
-        Whether the last update changed no term by more than a part of its standard deviation.
-    poses : tuple of MapPose
-        Where the maps lie whose poses are among the terms.
-    """
+    """Terms of the instruments that were estimated together with the magnetizations."""
 
     names: tuple[str, ...]
+    """Such as ``fringe.translation_x_m``, after the name of a map, a stage or a probe."""
     change: Floats
     sd: Floats
     prior_sd: Floats
+    """Change from what the study says, and standard deviations after and before. Shape (terms,)."""
     at_rest: bool
+    """Whether the last update changed no term by more than a part of its standard deviation."""
     poses: tuple[MapPose, ...]
+    """Where the maps lie whose poses are among the terms."""
 
 
 @dataclass(frozen=True)
 class Amplitudes:
-    """Uncertain amplitudes that were estimated together with the magnetizations.
-
-    Attributes
-    ----------
-    names : tuple of str
-        As in the tables ``[[uncertain]]`` of the study: those of the magnet, then of instruments.
-    change, sd, prior_sd : ndarray, shape (amplitudes,)
-        Change from what the study says, and standard deviations after and before.
-    """
+    """Uncertain amplitudes that were estimated together with the magnetizations."""
 
     names: tuple[str, ...]
+    """As in the tables ``[[uncertain]]`` of the study: those of the magnet, then of instruments."""
     change: Floats
     sd: Floats
     prior_sd: Floats
+    """Change from what the study says, and standard deviations after and before.
+    Shape (amplitudes,)."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """How one map agrees with what an update by another map alone predicts.
-
-    Attributes
-    ----------
-    name, by : str
-        The map that is predicted, and the map whose update predicts it.
-    readings : int
-        Number of readings of ``name`` within the region of ``by``: those that are held out, or all
-        of them if none is.
-    held_out : bool
-        Whether these readings are held out of the common update too.
-    rms_T : float
-        Rms difference from the prediction.
-    chi2 : float
-        Chi-squared per reading, by the covariance of prediction, noise and instruments.
-    """
+    """How one map agrees with what an update by another map alone predicts."""
 
     name: str
     by: str
+    """The map that is predicted, and the map whose update predicts it."""
     readings: int
+    """Number of readings of ``name`` within the region of ``by``: those that are held out, or all
+    of them if none is."""
     held_out: bool
+    """Whether these readings are held out of the common update too."""
     rms_T: float
+    """Rms difference from the prediction."""
     chi2: float
+    """Chi-squared per reading, by the covariance of prediction, noise and instruments."""
 
     @property
     def limit(self) -> float:
@@ -250,25 +211,17 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Stretch:
-    """How readings that were left out are predicted where they lie between two planes.
-
-    Attributes
-    ----------
-    axis : str
-        Of the magnet, along which the readings that were left out are longest.
-    from_m, to_m : float
-        Of the readings there, along this axis.
-    readings : int
-    rms_T, noise_T : float
-        As those of `LeftOut`.
-    """
+    """How readings that were left out are predicted where they lie between two planes."""
 
     axis: str
+    """Of the magnet, along which the readings that were left out are longest."""
     from_m: float
     to_m: float
+    """Of the readings there, along this axis."""
     readings: int
     rms_T: float
     noise_T: float
+    """As those of `LeftOut`."""
 
     @property
     def over_noise(self) -> float:
@@ -284,32 +237,21 @@ class Stretch:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """How an update that has not seen a whole map, or the ends of the only one, predicts it.
-
-    Attributes
-    ----------
-    name : str
-        The map; empty if it is the ends of the only one.
-    readings : int
-    rms_T : float
-        Rms difference from the prediction, with the pose and the probe that only this map has.
-    noise_T : float
-        Rms of noise and solver error of these readings.
-    allowed_T : float
-        Rms of noise and error bars of the prediction, without that pose and that probe.
-    chi2 : float
-        Chi-squared per reading, by the covariance of prediction, noise and instruments.
-    stretches : tuple of Stretch
-        The same along the magnet or across it.
-    """
+    """How an update that has not seen a whole map, or the ends of the only one, predicts it."""
 
     name: str
+    """The map; empty if it is the ends of the only one."""
     readings: int
     rms_T: float
+    """Rms difference from the prediction, with the pose and the probe that only this map has."""
     noise_T: float
+    """Rms of noise and solver error of these readings."""
     allowed_T: float
+    """Rms of noise and error bars of the prediction, without that pose and that probe."""
     chi2: float
+    """Chi-squared per reading, by the covariance of prediction, noise and instruments."""
     stretches: tuple[Stretch, ...] = ()
+    """The same along the magnet or across it."""
 
     @property
     def over_noise(self) -> float:
@@ -344,43 +286,32 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class RegionScore:
-    """Scores of the predictions of prior and posterior for the readings of a region and a part.
-
-    Attributes
-    ----------
-    region, part : str
-        Noise region and part (training, held out, held-out map) of the readings.
-    readings : int
-        Number of readings.
-    rms_error_prior_T, rms_error_posterior_T : float
-        Root mean square of measured minus predicted.
-    median_relative_error_prior, median_relative_error_posterior : float or None
-        Median of ``|measured - predicted| / |measured|`` over the readings that are not 0.
-    rms_standardized_prior, rms_standardized_posterior : float
-        Root mean square of the standardized residuals: measured minus predicted, divided by the
-        standard deviation of prediction, noise and solver together. That of the posterior is below
-        1 for training readings, to which the posterior was fitted.
-    coverage95_prior, coverage95_posterior : float or None
-        Fraction of the standardized residuals within their central 95 % band; None for training
-        readings.
-    chi2_prior, chi2_posterior : float or None
-        Chi-squared per reading by the full covariance of prediction, noise and solver; None for
-        training readings.
-    """
+    """Scores of the predictions of prior and posterior for the readings of a region and a part."""
 
     region: str
     part: str
+    """Noise region and part (training, held out, held-out map) of the readings."""
     readings: int
+    """Number of readings."""
     rms_error_prior_T: float
     rms_error_posterior_T: float
+    """Root mean square of measured minus predicted."""
     median_relative_error_prior: float | None
     median_relative_error_posterior: float | None
+    """Median of ``|measured - predicted| / |measured|`` over the readings that are not 0."""
     rms_standardized_prior: float
     rms_standardized_posterior: float
+    """Root mean square of the standardized residuals: measured minus predicted, divided by the
+    standard deviation of prediction, noise and solver together. That of the posterior is below 1
+    for training readings, to which the posterior was fitted."""
     coverage95_prior: float | None
     coverage95_posterior: float | None
+    """Fraction of the standardized residuals within their central 95 % band; None for training
+    readings."""
     chi2_prior: float | None
     chi2_posterior: float | None
+    """Chi-squared per reading by the full covariance of prediction, noise and solver; None for
+    training readings."""
 
 
 FAR_BARS = 10.0
@@ -433,6 +364,9 @@ class InferenceResult(ShownInNotebook):
         Their predictions of all readings.
     prediction_exact : Prediction
         That of the prior by a solver whose error no readings share.
+    prediction_field : Prediction or None
+        That of the posterior by instruments without the errors that were estimated; None if none
+        was, so that it is `prediction_posterior`.
     prior_conflict : float
         Chi-squared per training reading of the prior's prediction. It is about 1 if prior, model
         and noise are right; see `conflict_limit`.
@@ -505,6 +439,7 @@ class InferenceResult(ShownInNotebook):
     amplitudes: Amplitudes | None = None
     overlaps: tuple[Overlap, ...] = ()
     regions_left_out: tuple[LeftOut, ...] = ()
+    prediction_field: Prediction | None = None
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     stray_field: StrayField | None = None
     magnetic_axis: MagneticAxis | None = None
@@ -589,17 +524,13 @@ class InferenceResult(ShownInNotebook):
         """The field of the updated magnet at the places of the readings.
 
         A reading is linear in B at its sensor, so that the field is what the magnetizations make of
-        the reading, divided by the sensor's sensitivity. Terms of the instrument that were
-        estimated with the magnetizations are in their covariance, not in the field.
+        the reading, divided by the sensor's sensitivity. Terms and amplitudes of the instrument
+        that were estimated with the magnetizations are in their covariance, not in the field.
         """
-        observation, known = self.observation, self.prediction_posterior
-        mean, sd = known.mean, known.sd
-        if self.terms is not None:
-            mean, sd = predict(self.response.matrix, self.posterior)
-            mean = self.response.offset + mean
+        observation, known = self.observation, self.prediction_field or self.prediction_posterior
         size = np.linalg.norm(observation.sensitivities, axis=1)
         return SensedField(observation.places, observation.sensitivities / size[:, None],
-                           mean / size, np.hypot(sd, self.response.error) / size)
+                           known.mean / size, np.hypot(known.sd, self.response.error) / size)
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:

@@ -34,7 +34,6 @@ def check_same_magnet(
 
     Parameters
     ----------
-    magnet : Magnet
     study : Study
         The study of the results.
     nominal : ndarray, shape (parameters,), in A/m
@@ -124,16 +123,11 @@ def _with_version(disagreement: str, magnet: Magnet, study: Study) -> str:
 
 
 class StoredPosterior(dict[str, Gaussian]):
-    """Distributions of the magnetizations in A/m by name, ``prior`` and ``posterior``, of a file.
-
-    Attributes
-    ----------
-    disagreement : str or None
-        `InferenceResult.disagreement` of the update, or else its reservation; None if the file
-        does not state it.
-    """
+    """Distributions of the magnetizations in A/m, ``prior`` and ``posterior``, of a file."""
 
     disagreement: str | None = None
+    """`InferenceResult.disagreement` of the update, or else its reservation; None if the file does
+    not state it."""
 
 
 def write_inference(update: InferenceResult, folder: Path) -> None:
@@ -225,10 +219,7 @@ def _read_root(
 ) -> Floats | CovarianceFactor:
     """Return the stored root with ``size`` rows.
 
-    Raises
-    ------
-    KeyError, ValueError or TypeError
-        If the variables are missing or do not describe a root.
+    KeyError, ValueError or TypeError if the variables are missing or do not describe a root.
     """
     if f"{name}_left" in data and prior is not None:
         left = data[f"{name}_left"]

@@ -29,22 +29,17 @@ units of the noise."""
 
 @dataclass(frozen=True)
 class Magnitudes:
-    """The field about which readings of |B| are linear.
-
-    Attributes
-    ----------
-    directions : dict of str to ndarray, shape (k, 3)
-        Unit vectors of the field at the readings of each map of |B|; empty for those of the nominal
-        blocks.
-    turned : ndarray, shape (readings,), in T
-        How far |B| is from its length along the directions before; 0 for components.
-    bend : ndarray, shape (readings,), in T
-        By what is left unknown of the field across, see the module; empty before the first update.
-    """
+    """The field about which readings of |B| are linear."""
 
     directions: dict[str, Floats] = field(default_factory=dict)
+    """Unit vectors of the field at the readings of each map of |B|; empty for those of the nominal
+    blocks. Shape (k, 3)."""
     turned: Floats = field(default_factory=lambda: np.zeros(0))
+    """How far |B| is from its length along the directions before; 0 for components.
+    Shape (readings,), in T."""
     bend: Floats = field(default_factory=lambda: np.zeros(0))
+    """By what is left unknown of the field across, see the module; empty before the first update.
+    Shape (readings,), in T."""
 
     def about(
         self, readings: Readings, vectors: Response, model: Response, prior: Gaussian

@@ -258,11 +258,7 @@ def read_order(path: str | Path, blocks: Sequence[str]) -> tuple[str, ...]:
 
     forces.csv, with its rows in another order, is such a table.
 
-    Parameters
-    ----------
-    path : str or Path
-    blocks : sequence of str
-        Names of all blocks, each of which the table has to name once.
+    ``blocks``: names of all blocks, each of which the table has to name once.
 
     Raises
     ------

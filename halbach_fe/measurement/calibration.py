@@ -31,19 +31,13 @@ _ERROR = re.compile(r"%\s*err\w*\s*B([xyz])|B([xyz])_error_percent", re.IGNORECA
 
 @dataclass(frozen=True)
 class Calibration:
-    """The errors of a probe's sensors.
-
-    Attributes
-    ----------
-    name, sha256 : str
-        Name of the file, and digest of its content.
-    sensors : dict of str to (ndarray, ndarray)
-        For x, y and z: fields in T, ascending, and relative errors of the reading there.
-    """
+    """The errors of a probe's sensors."""
 
     name: str
     sha256: str
+    """Name of the file, and digest of its content."""
     sensors: dict[str, tuple[Floats, Floats]]
+    """For x, y and z: fields in T, ascending, and relative errors of the reading there."""
 
     def corrected(self, data: xr.Dataset, where: str) -> xr.Dataset:
         """Return a map, in T along the axes of the probe, with its readings corrected.

@@ -16,7 +16,7 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
@@ -68,46 +68,27 @@ below which so many repetitions are no chance."""
 
 @dataclass(frozen=True)
 class Map:
-    """A map, and what the study says about it.
-
-    Attributes
-    ----------
-    name : str
-    data : Dataset
-    study : Study
-        The study of this map alone.
-    middle_m : ndarray, shape (3,)
-        Middle of its points in the coordinates that the map states.
-    pivot_m : ndarray, shape (3,)
-        The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
-        middle, or that of the first map on the same stage.
-    probe : str
-        Name of its probe. Maps of one probe share its terms.
-    pose : str
-        Name of the stage or of the map whose pose it shares, mostly its own.
-    offsets : str
-        Name of the map whose offsets and drift it has, mostly its own.
-    shift_sd_m : tuple of float
-        Prior standard deviations of an own shift along the axes of the stage.
-    is_validation : bool
-        Whether it is predicted but does not update the model.
-    """
+    """A map, and what the study says about it."""
 
     name: str
     data: xr.Dataset
     study: Study
+    """The study of this map alone."""
     middle_m: Floats
+    """Middle of its points in the coordinates that the map states. Shape (3,)."""
     pivot_m: Floats
+    """The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
+    middle, or that of the first map on the same stage. Shape (3,)."""
     probe: str
+    """Name of its probe. Maps of one probe share its terms."""
     pose: str
+    """Name of the stage or of the map whose pose it shares, mostly its own."""
     offsets: str
+    """Name of the map whose offsets and drift it has, mostly its own."""
     shift_sd_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Prior standard deviations of an own shift along the axes of the stage."""
     is_validation: bool = False
-
-
-def middle_of(points: Floats) -> Floats:
-    """Return the middle (3,) in m of the box about points (n, 3)."""
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+    """Whether it is predicted but does not update the model."""
 
 
 @typed
@@ -157,7 +138,6 @@ def maps_of(
 
     Parameters
     ----------
-    study : Study
     data : Dataset or dict of str to Dataset
         The only map of a study that lists none, or the maps that it lists, by name.
     validation_map : Dataset, optional
@@ -325,6 +305,9 @@ def refuse_shared(
             both.sum(), max(SAME_READING * min(noise, sigma), MIN_SIGMA_T)))
         fewer, more = sorted(sides, key=len)
         shared = int(repeated(fewer, more, tolerance).sum())
+        offset = _offset(fewer, more)
+        beside = int(repeated(fewer - np.append(np.zeros(3), offset), more, tolerance).sum())
+        shifted, shared = beside > shared, max(beside, shared)
         exact = np.append(np.full(3, SAME_PLACE_M), np.full(both.sum(), SAME_DIGITS_T))
         copies = int(repeated(fewer, more, exact).sum())
         there = int(repeated(fewer[:, :3], more[:, :3], exact[:3]).sum())
@@ -335,8 +318,26 @@ def refuse_shared(
             _refuse(count, must_be(
                 f"`maps` '{one}' and '{other}'", where,
                 "different maps, as the same readings must not count twice",
-                f"the same readings in {shared if rounded else copies} of {len(fewer)} rows",
+                f"the same readings in {shared if rounded else copies} of {len(fewer)} rows" + (
+                    f", but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that "
+                    "all share" if shifted and rounded else ""),
                 "Remove one of them, or these rows of one."))
+
+
+def _offset(rows: Floats, others: Floats) -> Floats:
+    """Return by how much values (k,) of rows (n, 3 + k) and others (m, 3 + k) at the same places
+    differ in the median.
+
+    Copies of which a zero was taken off scatter no more about it than copies do.
+    """
+    if not len(rows) or not len(others):
+        return np.zeros(rows.shape[1] - 3)
+    distance, nearest = KDTree(others[:, :3]).query(
+        rows[:, :3], distance_upper_bound=SAME_PLACE_M)
+    near = np.isfinite(distance)
+    if not near.any():
+        return np.zeros(rows.shape[1] - 3)
+    return np.asarray(np.median(rows[near, 3:] - others[nearest[near], 3:], axis=0))
 
 
 def _refuse_mixed_probes(maps: Sequence[Map]) -> None:
@@ -409,4 +410,4 @@ def _seen_from(study: Study, first: Map) -> Floats:
 
 
 def _middle(study: Study, data: xr.Dataset) -> Floats:
-    return middle_of(points_of(in_si_and_magnet_axes(study.instrument, data)))
+    return box_middle(points_of(in_si_and_magnet_axes(study.instrument, data)))

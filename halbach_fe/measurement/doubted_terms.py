@@ -60,22 +60,14 @@ UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "": ("%", 100
 
 @dataclass(frozen=True)
 class Term:
-    """A number of a fit, and what was known of it before.
-
-    Attributes
-    ----------
-    name : str
-        What it is, in words: "gain of Bx".
-    unit : str
-        Its SI unit: m, rad, T, or nothing for parts of 1.
-    value : float
-        Its change from the mean of its prior.
-    prior_sd : float
-    """
+    """A number of a fit, and what was known of it before."""
 
     name: str
+    """What it is, in words: "gain of Bx"."""
     unit: str
+    """Its SI unit: m, rad, T, or nothing for parts of 1."""
     value: float
+    """Its change from the mean of its prior."""
     prior_sd: float
 
     @property
@@ -237,11 +229,8 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
                  ) -> tuple[Term, ...]:
     """Return the doubts about what an update has done to the blocks.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    mean, prior_mean, prior_sd : ndarray, shape (m,), in A/m
-        Parameters of the magnet, of which the first are the magnetizations of its blocks.
+    ``mean``, ``prior_mean`` and ``prior_sd`` (m,) in A/m: parameters of the magnet, of which the
+    first are the magnetizations of its blocks.
 
     Returns
     -------
@@ -270,12 +259,8 @@ def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tupl
     after the update would be at ``m / (1 - (s / p)**2)``. Where the readings alone determine a
     block, that is m, however far m is. Where they do not, its error bar is not to be believed.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    mean, sd : ndarray, shape (m,), in A/m
-        After the update, of all parameters, of which the first are the magnetizations of blocks.
-    prior : Gaussian
+    ``mean`` and ``sd`` (m,) in A/m: after the update, of all parameters, of which the first are the
+    magnetizations of blocks.
 
     Returns
     -------
@@ -304,7 +289,6 @@ def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: fl
 
     Parameters
     ----------
-    magnet : Magnet
     mean : ndarray, shape (m,), in A/m
         Parameters of the magnet, of which the first are the magnetizations of its blocks.
     prior : Gaussian

@@ -100,7 +100,7 @@ def field_map(
         or of the shape of ``B_T``.
     attributes : dict of str to str, optional
     components : sequence of str
-        Which components the columns of ``B_T`` are.
+        Which components the columns of ``B_T`` are: ``x`` or ``Bx``, ...
 
     Returns
     -------
@@ -119,6 +119,7 @@ def field_map(
     >>> data["B_T"].sel(component="y").values
     array([0.4 , 0.39])
     """
+    components = [re.sub(r"^[bB]_?([xyz])(_T)?$", r"\1", str(name)) for name in components]
     try:
         points, given = plain(points_m), plain(B_T, components)
     except (TypeError, ValueError, OverflowError) as error:
@@ -142,8 +143,7 @@ def field_map(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
             f"components out of {', '.join(COMPONENTS)}",
             f"{points.shape} and {given.shape}, for "
-            + ("'" + components + "'" if isinstance(components, str)
-               else ", ".join(map(str, components))),
+            + ", ".join(components),
             "State which components are given, as in components=['x', 'y']; readings of |B| come "
             "from a file with a column Babs_T."))
 
@@ -166,9 +166,15 @@ def field_map(
         except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
-        if sigma.shape == (len(points),) != (len(components),):
+        if sigma.shape == (len(points),) == (len(components),) and np.ptp(sigma) > 0:
+            raise MeasurementError(must_be(
+                "sigma_T", "field_map", f"of shape {given.shape}, as there are as many readings as "
+                "components", f"{sigma.shape}, of either",
+                "Give sigma_T[None, :] for each component, sigma_T[:, None] for each reading."))
+        if sigma.shape == (len(points),):
             sigma = sigma[:, None]
-        elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
+        elif sigma.shape not in ((), (len(components),), (1, len(components)), (len(points), 1),
+                                 given.shape):
             raise MeasurementError(must_be(
                 "sigma_T", "field_map", f"one number, or of shape ({len(points)},) or "
                 f"{given.shape}", str(sigma.shape)))
@@ -693,11 +699,8 @@ def _without_total(
     """Return which rows of a map hold nothing, |B| included; ``blank`` (n,) are those without any
     component.
 
-    Raises
-    ------
-    MeasurementError
-        If |B| is negative or infinite, its noise is not positive, or some rows hold components and
-        others |B| alone.
+    MeasurementError if |B| is negative or infinite, its noise is not positive, or some rows hold
+    components and others |B| alone.
     """
     total = data[TOTAL_COLUMN].values
     wrong = np.isinf(total) | (total < 0)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.threads import in_threads, share_out
 
 CLOSENESS = 0.45
@@ -43,18 +43,13 @@ UNIFORM = 1e3
 
 @dataclass(frozen=True)
 class Charges:
-    """Charges around a region, and a uniform field.
-
-    Attributes
-    ----------
-    places : ndarray, shape (k, 3), in m
-    scale : float, in m^2
-        A charge of amplitude 1 has the field ``scale R / |R|^3`` at the distance R, which has an
-        rms of some 1/sqrt(k) in the region.
-    """
+    """Charges around a region, and a uniform field."""
 
     places: Floats
+    """Shape (k, 3), in m."""
     scale: float
+    """A charge of amplitude 1 has the field ``scale R / |R|^3`` at the distance R, which has an rms
+    of some 1/sqrt(k) in the region. In m^2."""
 
     @classmethod
     def around(cls, points: Floats, gap: float) -> Charges:
@@ -141,8 +136,7 @@ class FewCharges(Charges):
         """Return B . u (n, r) per amplitude, for u (n, 3)."""
         result = np.empty((len(points), len(self)))
         of_all = Charges(self.places, self.scale)
-        for first in range(0, len(points), AT_ONCE):
-            some = slice(first, first + AT_ONCE)
+        for some in slices(len(points), AT_ONCE):
             np.matmul(of_all.fields_along(points[some], directions[some]), self.vectors,
                       out=result[some])
         return result
@@ -220,26 +214,18 @@ to which it is left out: the fit has 3 % of it at most."""
 
 @dataclass(frozen=True)
 class HarmonicFit:
-    """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument.
-
-    Attributes
-    ----------
-    amplitudes : ndarray, shape (k,), in T
-    penalty : float
-        Ratio of the variances of the noise and of an amplitude.
-    sigma : float, in T
-        Standard deviation of the readings from the fit.
-    log_evidence : float
-        Log probability of the readings, up to a constant, at the most probable penalty and sigma.
-    used : float
-        Number of amplitudes that the readings determine.
-    """
+    """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument."""
 
     amplitudes: Floats
+    """Shape (k,), in T."""
     penalty: float
+    """Ratio of the variances of the noise and of an amplitude."""
     sigma: float
+    """Standard deviation of the readings from the fit. In T."""
     log_evidence: float
+    """Log probability of the readings, up to a constant, at the most probable penalty and sigma."""
     used: float
+    """Number of amplitudes that the readings determine."""
 
 
 NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)
@@ -382,10 +368,9 @@ class FreeField:
 
     def _halves(self) -> Iterator[Floats]:
         """Yield half of the way to the solutions for some columns (k, m) of A^T at a time."""
-        for first in range(0, len(self.by_amplitude), AT_ONCE):
+        for part in slices(len(self.by_amplitude), AT_ONCE):
             yield np.asarray(linalg.solve_triangular(
-                self.lower, self.by_amplitude[first:first + AT_ONCE].T, lower=True,
-                check_finite=False))
+                self.lower, self.by_amplitude[part].T, lower=True, check_finite=False))
 
     def most_probable(self, readings: Floats) -> HarmonicFit:
         """Return the fit of readings (m,) by that one of `PENALTIES` which has most evidence.

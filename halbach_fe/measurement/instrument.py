@@ -12,6 +12,7 @@ applied in three ways:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,25 +36,19 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS, Axes
+from halbach_fe.study.types import COMPONENTS
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Positions of a mapper's sensors and their linear response to B, for a map of n points.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3) or (3 n, 3), in m
-        Position of the probe at each point of the map. If its three sensors are apart, the position
-        of each sensor, point by point.
-    operator : sparse array, shape (3 n, 3 len(points))
-        Maps B at ``points``, flattened point by point, to the linear part of the map's values (Bx,
-        By, Bz of each point).
-    """
+    """Positions of a mapper's sensors and their linear response to B, for a map of n points."""
 
     points: Floats
+    """Position of the probe at each point of the map. If its three sensors are apart, the position
+    of each sensor, point by point. Shape (n, 3) or (3 n, 3), in m."""
     operator: sparse.csr_array
+    """Maps B at ``points``, flattened point by point, to the linear part of the map's values (Bx,
+    By, Bz of each point). Shape (3 n, 3 len(points))."""
 
 
 def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
@@ -86,13 +81,13 @@ def by_stated_units(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
     return read.assign({name: data[name] * unit for name in TOTAL_COLUMNS if name in data})
 
 
-def to_magnet_axes(axes: Axes, columns: Floats) -> Floats:
-    """Convert vectors (n, 3) to the magnet's axes.
+def to_magnet_axes(axes: Sequence[str], columns: Floats) -> Floats:
+    """Convert vectors (n, 3) to the axes of the magnet, or of whatever else names the axes.
 
     Parameters
     ----------
-    axes : Axes
-        For each column of the vectors, the axis of the magnet along which it points, such as
+    axes : sequence of str
+        For each column of the vectors, the axis along which it points, such as
         ``("x", "-z", "y")``.
     columns : ndarray, shape (n, 3)
     """
@@ -184,7 +179,6 @@ def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floa
 
     Parameters
     ----------
-    instrument : Instrument
     fields : ndarray, shape (n, 3), in T
         B in the sensors' own axes.
     time : ndarray, shape (n,)

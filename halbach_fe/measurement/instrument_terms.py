@@ -60,7 +60,6 @@ def with_terms(instrument: Instrument, middle: Floats, changes: Floats) -> Instr
 
     Parameters
     ----------
-    instrument : Instrument
     middle : ndarray, shape (3,), in m
         The point of the map that the shift moves and the turn leaves in its place.
     changes : ndarray, shape (30,)
@@ -134,7 +133,6 @@ def by_terms(
 
     Parameters
     ----------
-    instrument : Instrument
     points : ndarray, shape (n, 3), in m
         Points as the map states them.
     middle : ndarray, shape (3,), in m

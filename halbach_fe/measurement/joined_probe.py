@@ -43,16 +43,12 @@ TURN_RAD = PLACED_SD[TURN.start]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a stage stands: a place p in its coordinates is ``turn p + shift_m``.
-
-    Attributes
-    ----------
-    turn : ndarray, shape (3, 3)
-    shift_m : ndarray, shape (3,)
-    """
+    """Where a stage stands: a place p in its coordinates is ``turn p + shift_m``."""
 
     turn: Floats
+    """Shape (3, 3)."""
     shift_m: Floats
+    """Shape (3,)."""
 
     def places(self, points: Floats) -> Floats:
         """Return the places (n, 3) of points (n, 3) of the stage, both in m."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
 from halbach_fe.core.pace import Pace, Progress
@@ -183,33 +183,23 @@ SCATTERED_M = 1e-6
 
 @dataclass(frozen=True)
 class InstrumentTerm:
-    """A parameter of the instrument as the map alone shows it.
-
-    Attributes
-    ----------
-    name, unit : str
-        Its unit is mm, mrad, % or mT.
-    value, sd : float
-        Estimate and standard deviation, in that unit.
-    determined : bool
-        Whether the map tells more about it than its prior.
-    plausible : bool
-        Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
-    predictive : bool
-        Whether no part of the map contradicts the others about it, see `_shown`.
-    rivals : tuple of str
-        Other parameters of which each by itself explains the map as well: one of all these is off,
-        and the map does not tell which.
-    """
+    """A parameter of the instrument as the map alone shows it."""
 
     name: str
     unit: str
+    """Its unit is mm, mrad, % or mT."""
     value: float
     sd: float
+    """Estimate and standard deviation, in that unit."""
     determined: bool
+    """Whether the map tells more about it than its prior."""
     plausible: bool
+    """Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`."""
     predictive: bool = True
+    """Whether no part of the map contradicts the others about it, see `_shown`."""
     rivals: tuple[str, ...] = ()
+    """Other parameters of which each by itself explains the map as well: one of all these is off,
+    and the map does not tell which."""
 
     @property
     def found(self) -> bool:
@@ -220,29 +210,20 @@ class InstrumentTerm:
 
 @dataclass(frozen=True)
 class Reach:
-    """The region of a map in which held-out scan lines are predicted to about their noise.
-
-    Attributes
-    ----------
-    along : str
-        What limits it: x, y or z, or "r", the distance from the line through the middle of the map
-        along its longest axis.
-    below : bool
-        Whether it is what is below the limit.
-    limit_m : float
-        Coordinate or distance of the farthest held-out readings in it; NaN if no region is.
-    inside_T, beyond_T : float
-        Rms difference of held-out lines from the field of all others in and beyond it.
-    noise_T : float
-        Noise with which they are compared.
-    """
+    """The region of a map in which held-out scan lines are predicted to about their noise."""
 
     along: str
+    """What limits it: x, y or z, or "r", the distance from the line through the middle of the map
+    along its longest axis."""
     below: bool
+    """Whether it is what is below the limit."""
     limit_m: float
+    """Coordinate or distance of the farthest held-out readings in it; NaN if no region is."""
     inside_T: float
     beyond_T: float
+    """Rms difference of held-out lines from the field of all others in and beyond it."""
     noise_T: float
+    """Noise with which they are compared."""
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell whether points (n, 3) in m, which span the map, are in it."""
@@ -855,8 +836,7 @@ def _thinned(scan: Scan) -> ProbeModel:
     Its charges are neither near nor far: those of a map near edges of magnets, fitted by far ones,
     gave sensors 10 mm off.
     """
-    some = scan.of(np.linspace(0, len(scan.points) - 1, min(
-        len(scan.points), SOME_POINTS)).astype(int))
+    some = scan.of(spread(np.arange(len(scan.points)), SOME_POINTS))
     return some.model(Charges.around(some.points, MIDDLING * point_spacing(scan.points)))
 
 

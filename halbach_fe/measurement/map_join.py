@@ -24,7 +24,7 @@ from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
@@ -134,28 +134,19 @@ TURNED_RAD = 0.5
 
 @dataclass(frozen=True)
 class Overlap:
-    """What the readings of a map say that others have around them.
-
-    Attributes
-    ----------
-    name : str
-    readings : int
-    chi2 : float
-        Per reading, with the covariance of the field that the other maps predict: 1 if they agree.
-    limit : float
-        Largest chi2 of maps that agree, the larger the fewer readings there are.
-    rms_T : float
-        Rms of what the joined field leaves of them.
-    alone_T : float
-        Rms of what a field of the map alone leaves of them.
-    """
+    """What the readings of a map say that others have around them."""
 
     name: str
     readings: int
     chi2: float
+    """Per reading, with the covariance of the field that the other maps predict: 1 if they
+    agree."""
     limit: float
+    """Largest chi2 of maps that agree, the larger the fewer readings there are."""
     rms_T: float
+    """Rms of what the joined field leaves of them."""
     alone_T: float
+    """Rms of what a field of the map alone leaves of them."""
 
     @property
     def agrees(self) -> bool:
@@ -165,30 +156,21 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Layer:
-    """Points that a stage read at one place of one of its axes, but that are of another place.
-
-    Attributes
-    ----------
-    name : str
-        Of the map.
-    axis : str
-        Of the stage: x, y or z.
-    place_m : float
-        What the map says, along this axis.
-    points : int
-        Rows there, all of which were left out; of a map that is joined in part, of that part.
-    off_m, off_sd_m : float
-        Where they were along this axis, by the readings of all maps, less where they should be,
-        with the standard deviation that noise makes. The field that was fitted follows such rows:
-        a fifth of 0.3 mm was lost at the border of a map.
-    """
+    """Points that a stage read at one place of one of its axes, but that are of another place."""
 
     name: str
+    """Of the map."""
     axis: str
+    """Of the stage: x, y or z."""
     place_m: float
+    """What the map says, along this axis."""
     points: int
+    """Rows there, all of which were left out; of a map that is joined in part, of that part."""
     off_m: float
     off_sd_m: float
+    """Where they were along this axis, by the readings of all maps, less where they should be, with
+    the standard deviation that noise makes. The field that was fitted follows such rows: a fifth of
+    0.3 mm was lost at the border of a map."""
 
 
 @dataclass(frozen=True)
@@ -197,26 +179,19 @@ class MapPose:
 
     A place p of the map is ``turn p + translation_m``, for the turn of ``rotation_rad``: these are
     keys of an `[instrument]`.
-
-    Attributes
-    ----------
-    name : str
-    middle_m : ndarray, shape (3,)
-        The middle of the map's points, in its own coordinates.
-    shift_m, shift_sd_m : ndarray, shape (3,)
-        Place of that middle in the frame of the first map, less ``middle_m``.
-    rotation_rad, rotation_sd_rad : ndarray, shape (3,)
-    sign : int
-        -1 if the readings have the opposite sign of those of the first map.
     """
 
     name: str
     middle_m: Floats
+    """The middle of the map's points, in its own coordinates. Shape (3,)."""
     shift_m: Floats
     shift_sd_m: Floats
+    """Place of that middle in the frame of the first map, less ``middle_m``. Shape (3,)."""
     rotation_rad: Floats
     rotation_sd_rad: Floats
+    """Shape (3,)."""
     sign: int
+    """-1 if the readings have the opposite sign of those of the first map."""
 
     @property
     def translation_m(self) -> Floats:
@@ -319,29 +294,19 @@ class JoinedMaps:
 
 @dataclass(frozen=True)
 class Checked:
-    """A map after its check: the rows that obey, and the field alone that fits them.
-
-    Attributes
-    ----------
-    name : str
-    data : Dataset
-        The map with its columns along the right axes, without rows that were left out.
-    check : MapCheck
-    ideal_T : ndarray, shape (n, 3)
-        What a probe without the errors that were found would have read.
-    floor_T : float
-        Rms of what the field alone predicts badly.
-    charges : Charges
-    amplitudes : ndarray, shape (k,)
-    """
+    """A map after its check: the rows that obey, and the field alone that fits them."""
 
     name: str
     data: xr.Dataset
+    """The map with its columns along the right axes, without rows that were left out."""
     check: MapCheck
     ideal_T: Floats
+    """What a probe without the errors that were found would have read. Shape (n, 3)."""
     floor_T: float
+    """Rms of what the field alone predicts badly."""
     charges: Charges
     amplitudes: Floats
+    """Shape (k,)."""
 
     @classmethod
     def of(cls, name: str, data: xr.Dataset, check: MapCheck) -> Checked:
@@ -353,7 +318,7 @@ class Checked:
             floor = check.reach.inside_T
         kept = oriented(data, check) if within is None else within
         points, ideal = points_of(kept), check.corrected_T[rows]
-        some = np.linspace(0, len(points) - 1, min(len(points), SOME_POINTS)).astype(int)
+        some = spread(np.arange(len(points)), SOME_POINTS)
         charges = Charges.around(points, check.gap_m)
         (fit,) = fit_fields(charges, points[some], [ideal[some]])
         return cls(name, kept, check, ideal, floor, charges, fit.amplitudes)
@@ -696,7 +661,7 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
         rows = np.flatnonzero(one.holds(pose.places(other.points)))
         if len(rows) < _fewest_shared(pose.turn, sign):
             return _Match(pose, sign, np.inf, np.nan, -np.inf)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), compared)).astype(int)]
+        rows = spread(rows, compared)
         points, read = other.points[rows], sign * other.ideal_T[rows]
 
         def left(values: Floats, start: Pose = pose, at: Floats = points,
@@ -739,26 +704,16 @@ def _two(values: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class _Joined:
-    """Maps in one field, with their fit.
-
-    Attributes
-    ----------
-    maps : sequence of Checked
-    scans : sequence of Scan
-    model : JoinedModel
-    at : ProbeFit
-    rows : ndarray of bool, shape (n,)
-        Rows that are fitted.
-    width2 : float
-        Prior variance of the amplitudes in T^2.
-    """
+    """Maps in one field, with their fit."""
 
     maps: Sequence[Checked]
     scans: Sequence[Scan]
     model: JoinedModel
     at: ProbeFit
     rows: NDArray[np.bool_]
+    """Rows that are fitted. Shape (n,)."""
     width2: float
+    """Prior variance of the amplitudes in T^2."""
 
     @classmethod
     def of(
@@ -1046,26 +1001,17 @@ class _Joined:
 
 @dataclass(frozen=True)
 class _Told:
-    """What the readings tell of other causes beside the field and some terms.
-
-    Attributes
-    ----------
-    state : State
-    left : ndarray, shape (m, p)
-        What the field leaves of the design of the terms.
-    covariance : ndarray, shape (p, p)
-        Of the terms, relative to sigma^2.
-    step : ndarray, shape (p,)
-        By which the terms fit best.
-    gained : float
-        By how much chi2 is smaller then.
-    """
+    """What the readings tell of other causes beside the field and some terms."""
 
     state: State
     left: Floats
+    """What the field leaves of the design of the terms. Shape (m, p)."""
     covariance: Floats
+    """Of the terms, relative to sigma^2. Shape (p, p)."""
     step: Floats
+    """By which the terms fit best. Shape (p,)."""
     gained: float
+    """By how much chi2 is smaller then."""
 
     @classmethod
     def of(cls, joined: _Joined, kept: NDArray[np.bool_]) -> _Told:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import sensor_model
+from halbach_fe.measurement.instrument import by_stated_units, sensor_model
 from halbach_fe.measurement.scan_lines import held_out_lines, scan_lines
 from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCoefficients
 from halbach_fe.study.model import Study
@@ -32,32 +32,24 @@ TOTAL_LABEL = "|B|"
 
 @dataclass(frozen=True)
 class Observation:
-    """Readings as linear functions of B at the sensors, and of a field map.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), in m
-        Positions of the sensors, by the study's instrument.
-    operator : sparse array, shape (readings, 3 n)
-        Maps B in T at the sensors, flattened point by point, to the readings; both steps combined.
-    analysis : sparse array, shape (readings, 3 m)
-        Maps B in T of the field map's m points, flattened point by point, to the readings.
-    map_points : ndarray, shape (m, 3), in m
-        Positions as the map states them.
-    labels : tuple of str
-        Name of each reading: ``Bx``, ``By``, ``Bz``, ``|B|``, or ``A1`` ... ``B8`` of a circle.
-        A reading of |B| is linear in B about a field of given direction, see `observe_total`.
-    positions : ndarray, shape (readings, 3), in m
-        Position of each reading as the map states it; for a Fourier coefficient the point of its
-        circle at angle 0.
-    """
+    """Readings as linear functions of B at the sensors, and of a field map."""
 
     points: Floats
+    """Positions of the sensors, by the study's instrument. Shape (n, 3), in m."""
     operator: sparse.csr_array
+    """Maps B in T at the sensors, flattened point by point, to the readings; both steps combined.
+    Shape (readings, 3 n)."""
     analysis: sparse.csr_array
+    """Maps B in T of the field map's m points, flattened point by point, to the readings.
+    Shape (readings, 3 m)."""
     map_points: Floats
+    """Positions as the map states them. Shape (m, 3), in m."""
     labels: tuple[str, ...]
+    """Name of each reading: ``Bx``, ``By``, ``Bz``, ``|B|``, or ``A1`` ... ``B8`` of a circle. A
+    reading of |B| is linear in B about a field of given direction, see `observe_total`."""
     positions: Floats
+    """Position of each reading as the map states it; for a Fourier coefficient the point of its
+    circle at angle 0. Shape (readings, 3), in m."""
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -121,10 +113,7 @@ class Observation:
     def part(self, rows: slice) -> tuple[Ints, sparse.csr_array]:
         """Restrict the operator to some readings and the points that they depend on.
 
-        Parameters
-        ----------
-        rows : slice
-            The r readings.
+        ``rows``: the r readings.
 
         Returns
         -------
@@ -209,7 +198,6 @@ def observe_total(
 
     Parameters
     ----------
-    study : Study
     points : ndarray, shape (n, 3), in m
         Positions as the map states them.
     measured : ndarray of bool, shape (n,)
@@ -253,7 +241,6 @@ def observe(
 
     Parameters
     ----------
-    study : Study
     points : ndarray, shape (n, 3), in m
         Positions as the map states them.
     measured : ndarray of bool, shape (n, 3)
@@ -311,7 +298,7 @@ def study_for_validation_map(study: Study, data: xr.Dataset) -> Study:
     """
     observed = study.observation
     if observed.quantity == "flux_density" or _on_circles(
-            points_of(data), observed.positions).any():
+            points_of(by_stated_units(study.instrument, data)), observed.positions).any():
         return study
     if "sigma_T" not in data:
         raise MeasurementError(must_be(
@@ -373,7 +360,6 @@ def fourier_analysis(
     Parameters
     ----------
     points : ndarray, shape (n, 3), in m
-    settings : FourierCoefficients
 
     Returns
     -------

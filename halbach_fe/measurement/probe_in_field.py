@@ -78,30 +78,22 @@ MATRICES = _matrices()
 
 @dataclass(frozen=True)
 class ProbeFit:
-    """A field together with an instrument.
-
-    Attributes
-    ----------
-    amplitudes : ndarray, shape (k,)
-    instrument : ndarray, shape (p,)
-        In units of `PRIOR_SD`.
-    covariance : ndarray, shape (p, p)
-    sigma : float, in T
-    used : float
-        Number of parameters that the readings determine.
-    prior_sd : ndarray, shape (p,)
-        Prior standard deviations in SI.
-    lag : bool
-        Whether the stage moved in more than one direction along the lines.
-    """
+    """A field together with an instrument."""
 
     amplitudes: Floats
+    """Shape (k,)."""
     instrument: Floats
+    """In units of `PRIOR_SD`. Shape (p,)."""
     covariance: Floats
+    """Shape (p, p)."""
     sigma: float
+    """In T."""
     used: float
+    """Number of parameters that the readings determine."""
     prior_sd: Floats
+    """Prior standard deviations in SI. Shape (p,)."""
     lag: bool
+    """Whether the stage moved in more than one direction along the lines."""
 
     @property
     def sensors_m(self) -> Floats:
@@ -402,17 +394,13 @@ def fit_probe(
 
 @dataclass(frozen=True)
 class Evidence:
-    """What some readings tell of the instrument, linearized: ``information @ instrument = sums``.
-
-    Attributes
-    ----------
-    information : ndarray, shape (p, p)
-    sums : ndarray, shape (p,)
-        The instrument is in units of `PRIOR_SD`. The field is that of these readings, too.
-    """
+    """What some readings tell of the instrument: ``information @ instrument = sums``."""
 
     information: Floats
+    """Shape (p, p)."""
     sums: Floats
+    """The instrument is in units of `PRIOR_SD`. The field is that of these readings, too.
+    Shape (p,)."""
 
     @classmethod
     def of(
@@ -455,25 +443,18 @@ class Evidence:
 
 @dataclass(frozen=True)
 class State:
-    """The field of largest probability for an instrument and a noise.
-
-    Attributes
-    ----------
-    at : ProbeFit
-    chi2 : float
-        With the prior of amplitudes and instrument.
-    left : ndarray, shape (m,), in T
-    target : ndarray, shape (m,), in T
-    free : FreeField
-    """
+    """The field of largest probability for an instrument and a noise."""
 
     model: ProbeModel
     rows: NDArray[np.bool_]
     width2: float
     at: ProbeFit
     chi2: float
+    """With the prior of amplitudes and instrument."""
     left: Floats
+    """Shape (m,), in T."""
     target: Floats
+    """Shape (m,), in T."""
     free: FreeField
 
     @classmethod
@@ -591,21 +572,14 @@ def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What residuals tell of the noise of readings and of positions.
-
-    Attributes
-    ----------
-    noise_T : float
-    position_m, position_sd_m : float
-        Noise of positions and its standard deviation; 0 if nothing tells it.
-    at_most : bool
-        Whether ``position_m`` is an upper limit, as more than positions is left.
-    """
+    """What residuals tell of the noise of readings and of positions."""
 
     noise_T: float
     position_m: float
     position_sd_m: float = 0.0
+    """Noise of positions and its standard deviation; 0 if nothing tells it."""
     at_most: bool = False
+    """Whether ``position_m`` is an upper limit, as more than positions is left."""
 
 
 def scatter_of(gradient: Floats, residual: Floats) -> Scatter:

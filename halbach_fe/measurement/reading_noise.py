@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import TOTAL_SIGMA_COLUMN, is_total_field
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix
@@ -90,9 +91,8 @@ def reading_noise(
     elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {magnet.name} must say how noisy the readings are, since "
-            + (f"{where} has no sigma_T" if data else "no map is there that has sigma_T")
-            + "; instead it is missing. Add [[noise.regions]] to the study"
-            + (", or sigma_T to the map." if data else "."))
+            f"{where} has no sigma_T; instead it is missing. Add [[noise.regions]] to the study, "
+            "or sigma_T to the map.")
     else:
         sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
             settings, observation.positions[:, 2], observation.components, where)]
@@ -109,7 +109,8 @@ def reading_noise(
 def readings_per_displacement(
     magnet: Magnet, analysis: sparse.csr_array, points: Floats, sd: Floats
 ) -> sparse.csr_array:
-    """Return the changes of the readings if each of n points is displaced along each axis.
+    """Return the changes of the readings if each of n points is displaced along each axis of the
+    stage, which may be turned in the magnet.
 
     The field gradient is that of the magnet's blocks in vacuum. The reaction field of recoil
     permeability and iron, some per cent of the field in the bore, is neglected: the result only
@@ -126,14 +127,16 @@ def readings_per_displacement(
     points : ndarray, shape (n, 3), in m
         Positions of the probe in the magnet.
     sd : ndarray, shape (3,), in m
-        Displacements along x, y and z, usually standard deviations.
+        Displacements along x, y and z of the stage, usually standard deviations.
 
     Returns
     -------
     changes : sparse array, shape (readings, 3 n), in T
         One column for each point and axis.
     """
-    gradient = sensor_matrix(magnet.study.instrument) @ gradient_of(magnet.blocks, points) * sd
+    instrument = magnet.study.instrument
+    moved = rotation_matrix(instrument.rotation_rad) * sd  # columns, in the magnet
+    gradient = sensor_matrix(instrument) @ gradient_of(magnet.blocks, points) @ moved
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
         analysis @ sparse.bsr_array((gradient, number[:-1], number)))

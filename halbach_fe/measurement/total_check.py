@@ -30,34 +30,23 @@ FEWEST_REPEATS = 3
 
 @dataclass(frozen=True)
 class TotalCheck:
-    """What a map of |B| shows by itself.
-
-    Attributes
-    ----------
-    points : int
-        Number of readings.
-    size_T : float
-        Largest |B|.
-    broken : dict of str to list of int
-        Numbers of the rows that are zero, repeated or spikes, counted from 1.
-    noise_T : float
-        Upper limit of the noise: rms, by the median, of what quadratic functions through the
-        neighbours leave of a reading. NaN if there are too few readings, or all lie on a line.
-    repeats : int
-        Number of places that were read more than once.
-    repeatability_T : float
-        Noise of a reading by these; NaN if there are fewer than `FEWEST_REPEATS`.
-    excluded : ndarray of bool, shape (n,)
-        Rows that are broken.
-    """
+    """What a map of |B| shows by itself."""
 
     points: int
+    """Number of readings."""
     size_T: float
+    """Largest |B|."""
     broken: dict[str, list[int]]
+    """Numbers of the rows that are zero, repeated or spikes, counted from 1."""
     noise_T: float
+    """Upper limit of the noise: rms, by the median, of what quadratic functions through the
+    neighbours leave of a reading. NaN if there are too few readings, or all lie on a line."""
     repeats: int
+    """Number of places that were read more than once."""
     repeatability_T: float
+    """Noise of a reading by these; NaN if there are fewer than `FEWEST_REPEATS`."""
     excluded: NDArray[np.bool_]
+    """Rows that are broken. Shape (n,)."""
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON."""

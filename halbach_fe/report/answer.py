@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from halbach_fe.core.errors import printable
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import OWN_NOISE, Reservation
 from halbach_fe.report.words import in_a_row
 from halbach_fe.study.model import Study
@@ -79,46 +80,32 @@ def known_paths(paths: Mapping[str, object]) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a command in plain words.
-
-    Attributes
-    ----------
-    question : str
-        What was asked.
-    said : str
-        The answer, with its uncertainty.
-    trust : str
-        Whether it can be trusted, and why not.
-    step : str
-        What to do next.
-    command : str
-        The command for that, in which STUDY, MAP, BLOCKS and POSTERIOR stand for files of the user,
-        ``DIR/`` for the folder of this command, and a single DIR for another one; empty if no
-        command does it.
-    sound : bool
-        Whether the answer may be used as it stands. Otherwise its box is a warning.
-    concern : str
-        What is bad about the magnet itself, in a sentence that no summary may leave out; empty if
-        nothing is.
-    changes_study : bool
-        Whether a study that the command wrote says something else than the one that it read, beyond
-        the error bars. Otherwise results of the one are as good as those of the other.
-    gist : str
-        The answer in a sentence, where that is not the first one of ``said``.
-    numbers : tuple of (str, str)
-        What the answer is about, and its size with a unit: the largest type of the page.
-    """
+    """The answer of a command in plain words."""
 
     question: str
+    """What was asked."""
     said: str
+    """The answer, with its uncertainty."""
     trust: str
+    """Whether it can be trusted, and why not."""
     step: str
+    """What to do next."""
     command: str = ""
+    """The command for that, in which STUDY, MAP, BLOCKS and POSTERIOR stand for files of the user,
+    ``DIR/`` for the folder of this command, and a single DIR for another one; empty if no command
+    does it."""
     sound: bool = True
+    """Whether the answer may be used as it stands. Otherwise its box is a warning."""
     concern: str = ""
+    """What is bad about the magnet itself, in a sentence that no summary may leave out; empty if
+    nothing is."""
     changes_study: bool = True
+    """Whether a study that the command wrote says something else than the one that it read, beyond
+    the error bars. Otherwise results of the one are as good as those of the other."""
     gist: str = ""
+    """The answer in a sentence, where that is not the first one of ``said``."""
     numbers: tuple[tuple[str, str], ...] = ()
+    """What the answer is about, and its size with a unit: the largest type of the page."""
 
     @property
     def headline(self) -> str:
@@ -209,6 +196,15 @@ def agreement(disagreement: str | None) -> str:
             if disagreement is None else "Yes: the update agrees with its map.")
 
 
+def along_the_axis(magnet: Magnet, options: str = "") -> tuple[str, str]:
+    """Return the next step, and its command, of a magnet whose field has to cancel along z."""
+    middle, reach = magnet.middle_z_m, 5 * (magnet.half_length + magnet.radius)
+    return ("See its field on the axis, whose first and second integrals must vanish: an undulator "
+            "has no mean field to be homogeneous.",
+            f"halbach-fe field STUDY {options}--from-m 0 0 {middle - reach:.3g} --to-m 0 0 "
+            f"{middle + reach:.3g} --count 2001 -o DIR")
+
+
 STATE_NOISE = ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "
                "command finds it.", "halbach-fe check MAP -o DIR")
 """The next step, and its command, if readings scatter less than their noise."""
@@ -254,20 +250,13 @@ LEGIBLE_PX = 9
 
 
 class Picture(NamedTuple):
-    """A figure in a page.
-
-    Attributes
-    ----------
-    png : str
-        The picture in base64.
-    caption : str
-    file : str
-        Name of its file beside the page.
-    """
+    """A figure in a page."""
 
     png: str
+    """The picture in base64."""
     caption: str
     file: str = ""
+    """Name of its file beside the page."""
 
     @property
     def legible_px(self) -> int:
@@ -313,31 +302,20 @@ class FigureFile(BaseModel):
 
 
 class PageRecord(BaseModel):
-    """The content of page.json.
-
-    Attributes
-    ----------
-    page : str
-        Name of the page's file.
-    title : str
-    answer : Answer or None
-    figures : tuple of FigureFile
-        In the order of the page.
-    rows : tuple of dict of str to str
-        The page's main table; empty if it has none.
-    provenance : dict of str to str
-    study : Study or None
-        The study that the results are of.
-    """
+    """The content of page.json."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     page: Text
+    """Name of the page's file."""
     title: Text
     answer: Annotated[Answer, AfterValidator(_cleaned_answer)] | None = None
     figures: tuple[FigureFile, ...] = ()
+    """In the order of the page."""
     rows: tuple[Row, ...] = ()
+    """The page's main table; empty if it has none."""
     provenance: dict[Text, Text] = {}
     study: Study | None = None
+    """The study that the results are of."""
 
 
 def write_record(

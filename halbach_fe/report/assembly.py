@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from markupsafe import Markup
 
-from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area
+from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area, slices
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.assembly import AssembledBlock, Assembly
@@ -44,14 +44,7 @@ LETTER, LARGEST = 0.6, 1 / 18
 
 @dataclass(frozen=True)
 class Sheet:
-    """The blocks of one drawing.
-
-    Attributes
-    ----------
-    title : str
-    blocks : sequence of AssembledBlock
-    plate : Plate or None
-    """
+    """The blocks of one drawing."""
 
     title: str
     blocks: Sequence[AssembledBlock]
@@ -104,62 +97,41 @@ def _rings(blocks: Sequence[AssembledBlock]) -> str:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A block in a drawing; lengths are in mm, and y points down.
-
-    Attributes
-    ----------
-    path : str
-        Its outline.
-    arrow : tuple of 4 floats, or None
-        Start and end of the arrow of its magnetization.
-    width : float
-        Width of the arrow.
-    label : str
-        Number of its slot, and serial number.
-    x, y, turn_deg, anchor
-        Place and direction of the label, and which of its ends is there.
-    size : float
-        Height of its letters.
-    """
+    """A block in a drawing; lengths are in mm, and y points down."""
 
     path: str
+    """Its outline."""
     arrow: tuple[float, float, float, float] | None
+    """Start and end of the arrow of its magnetization."""
     width: float
+    """Width of the arrow."""
     label: str
+    """Number of its slot, and serial number."""
     x: float
     y: float
     turn_deg: float
     anchor: str
+    """Place and direction of the label, and which of its ends is there."""
     size: float
+    """Height of its letters."""
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A sheet as the template draws it, in mm.
-
-    Attributes
-    ----------
-    title : str
-    blocks : list of Drawn
-    plate : str
-        Path of the plate and its openings.
-    engraved : str
-        Path of the bars of the engraved number.
-    number : int or None
-        Number of the plate; None without one.
-    reach : float
-        Half the size of the drawing.
-    tables : list of list of dict
-        Rows of text for the tables side by side.
-    """
+    """A sheet as the template draws it, in mm."""
 
     title: str
     blocks: list[Drawn]
     plate: str
+    """Path of the plate and its openings."""
     engraved: str
+    """Path of the bars of the engraved number."""
     number: int | None
+    """Number of the plate; None without one."""
     reach: float
+    """Half the size of the drawing."""
     tables: list[Rows]
+    """Rows of text for the tables side by side."""
 
 
 def drawing(
@@ -308,7 +280,7 @@ def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[Rows]:
                            .replace("clockwise", "cw").replace("from outwards, ", "")})
     tables = min(most_tables, -(-len(rows) // shortest))
     length = -(-len(rows) // tables)
-    return [rows[start:start + length] for start in range(0, len(rows), length)]
+    return [rows[part] for part in slices(len(rows), length)]
 
 
 def _outline_mm(one: AssembledBlock) -> Floats:

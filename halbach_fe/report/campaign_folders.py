@@ -57,42 +57,26 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class Page:
-    """A page of a folder.
-
-    Attributes
-    ----------
-    path : str
-        Its file, within the folder.
-    said : PageRecord
-    picture : Picture or None
-        Its most telling figure.
-    """
+    """A page of a folder."""
 
     path: str
+    """Its file, within the folder."""
     said: PageRecord
     picture: Picture | None
+    """Its most telling figure."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chapter:
-    """The results in a folder.
-
-    Attributes
-    ----------
-    folder : Path
-    label : str
-        The folder's name in texts.
-    record : Record
-    pages : tuple of Page
-    changed : tuple of str
-        Results that somebody has changed or, but for figures, removed since.
-    """
+    """The results in a folder."""
 
     folder: Path
     label: str
+    """The folder's name in texts."""
     record: Record
     pages: tuple[Page, ...]
     changed: tuple[str, ...]
+    """Results that somebody has changed or, but for figures, removed since."""
 
     @property
     def verb(self) -> str:

@@ -53,15 +53,10 @@ POSTERIOR = "posterior.h5"
 
 @dataclass(frozen=True)
 class Campaign:
-    """What folders of results say about one magnet.
-
-    Attributes
-    ----------
-    chapters : tuple of Chapter
-        In the order in which data flow.
-    """
+    """What folders of results say about one magnet."""
 
     chapters: tuple[Chapter, ...]
+    """In the order in which data flow."""
 
     @cached_property
     def study(self) -> Study:

@@ -91,23 +91,16 @@ def answer(found: DemagnetizationMap) -> Answer:
 
 @dataclass(frozen=True)
 class _Losses:
-    """Whether magnetization is lost, and whether that can be known.
-
-    Attributes
-    ----------
-    now, at_room : bool
-        Whether some is lost at the temperature of the study, and at room temperature.
-    far : float or None
-        Factor of the coercivity at that temperature, if it is so far from the reference that the
-        coefficients of the study do not hold.
-    sure : bool
-        Whether some is lost on the way to that temperature, where they hold.
-    """
+    """Whether magnetization is lost, and whether that can be known."""
 
     now: bool
     at_room: bool
+    """Whether some is lost at the temperature of the study, and at room temperature."""
     far: float | None
+    """Factor of the coercivity at that temperature, if it is so far from the reference that the
+    coefficients of the study do not hold."""
     sure: bool
+    """Whether some is lost on the way to that temperature, where they hold."""
 
     @classmethod
     def of(cls, found: DemagnetizationMap) -> _Losses:

@@ -58,26 +58,17 @@ GROUP_TITLES = {"map": "by map", "z": "along z", "angle": "by angle", "radius": 
 
 @dataclass(frozen=True)
 class State:
-    """A model in a report: the study before the diagnosis, or with the findings.
-
-    Attributes
-    ----------
-    when : str
-        Label of the state.
-    update : InferenceResult
-    groups : sequence of ResidualGroup
-    loo_residuals : ndarray, shape (n,)
-        Standardized leave-one-out residuals of the training readings.
-    colour, marker : str
-        Of the state in figures.
-    """
+    """A model in a report: the study before the diagnosis, or with the findings."""
 
     when: str
+    """Label of the state."""
     update: InferenceResult
     groups: Sequence[ResidualGroup]
     loo_residuals: Floats
+    """Standardized leave-one-out residuals of the training readings. Shape (n,)."""
     colour: str
     marker: str
+    """Of the state in figures."""
 
 
 def states(diagnosis: Diagnosis) -> list[State]:
@@ -342,11 +333,7 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
     These are the readings with the largest residuals of all lines along z, circles, or coefficients
     of one kind. If no line has as many as `FEWEST_ON_A_LINE`, they are all of one component.
 
-    Parameters
-    ----------
-    update : InferenceResult
-    loo_residuals : ndarray, shape (n,)
-        Standardized leave-one-out residuals of the training readings.
+    ``loo_residuals`` (n,): standardized leave-one-out residuals of the training readings.
 
     Returns
     -------

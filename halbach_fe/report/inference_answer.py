@@ -9,7 +9,7 @@ import numpy as np
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
-from halbach_fe.report.answer import STATE_NOISE, Answer
+from halbach_fe.report.answer import STATE_NOISE, Answer, along_the_axis
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
     decimals,
@@ -96,6 +96,9 @@ def _after_agreement(result: InferenceResult) -> tuple[str, str]:
     mend = "" if not faults else (
         f"This is the magnet with blocks that are not as designed ({faults}): put that right and "
         "measure again, or go on with it as it is. ")
+    if result.magnet.cancels_along_z and not result.magnet.study.homogeneity:
+        said, command = along_the_axis(result.magnet, "--posterior DIR/posterior.h5 ")
+        return mend + said, command
     return (f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
             f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
             f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "

@@ -13,7 +13,7 @@ import scipy.sparse as sparse
 from markupsafe import Markup
 from scipy.spatial import Delaunay
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
@@ -140,67 +140,44 @@ IDENTITY = "magnet-view"
 
 @dataclass(frozen=True)
 class Colours:
-    """Numbers that are shown as the colours of the blocks.
-
-    Attributes
-    ----------
-    values : ndarray, shape (blocks,)
-        The number of each block.
-    title : str
-        Title of the colour scale.
-    words : sequence of str
-        Text that appears when the pointer is over a block, one for each block.
-    limits : tuple of float, or None
-        Ends of an unsigned colour scale. If None, the scale is signed and symmetric about 0.
-    """
+    """Numbers that are shown as the colours of the blocks."""
 
     values: Floats
+    """The number of each block. Shape (blocks,)."""
     title: str
+    """Title of the colour scale."""
     words: Sequence[str]
+    """Text that appears when the pointer is over a block, one for each block."""
     limits: tuple[float, float] | None = None
+    """Ends of an unsigned colour scale. If None, the scale is signed and symmetric about 0."""
 
 
 @dataclass(frozen=True)
 class BlockValues:
-    """Values of the blocks that a view shows.
-
-    Attributes
-    ----------
-    magnetization : ndarray, shape (blocks, D), in A/m
-        Magnetization vectors, drawn as arrows.
-    colours : Colours or None
-        Colours of the blocks. If None, all blocks are grey (before a measurement).
-    """
+    """Values of the blocks that a view shows."""
 
     magnetization: Floats
+    """Magnetization vectors, drawn as arrows. Shape (blocks, D), in A/m."""
     colours: Colours | None = None
+    """Colours of the blocks. If None, all blocks are grey (before a measurement)."""
 
 
 @dataclass(frozen=True)
 class ViewPoints:
-    """Points of a field map, coloured by the magnitude of a value at each point.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n, 3), in m
-    values : ndarray, shape (n,)
-        May be signed; the colour shows the magnitude.
-    name : str
-        Name of the points in the legend.
-    title : str
-        Title of the colour scale.
-    words : str
-        Text that appears when the pointer is over a point; %{customdata} stands for its value.
-    limits : tuple of float, or None
-        Ends of the colour scale, which are magnitudes; by default those of the values.
-    """
+    """Points of a field map, coloured by the magnitude of a value at each point."""
 
     positions: Floats
+    """Shape (n, 3), in m."""
     values: Floats
+    """May be signed; the colour shows the magnitude. Shape (n,)."""
     name: str
+    """Name of the points in the legend."""
     title: str
+    """Title of the colour scale."""
     words: str
+    """Text that appears when the pointer is over a point; %{customdata} stands for its value."""
     limits: tuple[float, float] | None = None
+    """Ends of the colour scale, which are magnitudes; by default those of the values."""
 
 
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
@@ -211,8 +188,7 @@ def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
 
 def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
     """Return the view of a nominal magnet and the points of a map, `MOST_POINTS` at most."""
-    count = len(points.positions)
-    drawn = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    drawn = spread(np.arange(len(points.positions)), MOST_POINTS)
     return magnet_view(
         magnet, BlockValues(magnet.nominal_magnetization.reshape(len(magnet.blocks), -1)), replace(
             points, positions=points.positions[drawn], values=points.values[drawn],
@@ -284,8 +260,7 @@ def residual_points(positions: Floats, scores: Floats) -> ViewPoints:
     worst[inverse.ravel()[order]] = scores[order]
     if len(points) > MOST_POINTS:
         kept = np.sort(np.argsort(-np.abs(worst))[:MOST_POINTS // 2])
-        evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
-        chosen = np.union1d(kept, evenly)
+        chosen = np.union1d(kept, spread(np.arange(len(points)), MOST_POINTS // 2))
         points, worst = points[chosen], worst[chosen]
     return ViewPoints(points, worst, "measured points", "largest standardized<br>residual in sd",
                       "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
@@ -488,11 +463,7 @@ def _hover_text(block: MagnetBlock, more: int, values: BlockValues, number: int)
 def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     """Triangulate the surface of a block.
 
-    Parameters
-    ----------
-    block : MagnetBlock
-    height : float
-        Drawn height in m of a block of infinite length.
+    ``height``: drawn height in m of a block of infinite length.
 
     Returns
     -------

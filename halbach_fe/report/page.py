@@ -316,10 +316,7 @@ def save(
 ) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
 
-    Parameters
-    ----------
-    figures : mapping
-        Figure, or how it is drawn, and caption, by file name.
+    ``figures``: figure, or how it is drawn, and caption, by file name.
     """
     pictures = []
     for name, (figure, caption) in figures.items():

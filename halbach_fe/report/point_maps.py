@@ -42,27 +42,18 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class Panel:
-    """Points of a map that are drawn in a plane.
-
-    Attributes
-    ----------
-    title : str
-        Where they are.
-    points : ndarray of int, shape (n,)
-        Their numbers.
-    first, second : ndarray, shape (n,)
-        Abscissae and ordinates, in the units of the labels.
-    labels : tuple of two str
-    lengths : bool
-        Whether both are lengths, drawn to scale if that leaves something to see.
-    """
+    """Points of a map that are drawn in a plane."""
 
     title: str
+    """Where they are."""
     points: Ints
+    """Their numbers. Shape (n,)."""
     first: Floats
     second: Floats
+    """Abscissae and ordinates, in the units of the labels. Shape (n,)."""
     labels: tuple[str, str]
     lengths: bool
+    """Whether both are lengths, drawn to scale if that leaves something to see."""
 
 
 def curve(points: Floats) -> tuple[Floats, str] | None:
@@ -251,24 +242,16 @@ FEWEST_ON_A_LINE = 5
 
 @dataclass(frozen=True)
 class ReadingLine:
-    """Readings of the same quantity along z, around a circle, or by harmonic.
-
-    Attributes
-    ----------
-    what : str
-        Label of the quantity.
-    index : ndarray, shape (n,)
-        Numbers of the readings.
-    place : ndarray, shape (n,)
-        Coordinates of the readings along the line, increasing.
-    axis : str
-        Name of the coordinate, with its unit.
-    """
+    """Readings of the same quantity along z, around a circle, or by harmonic."""
 
     what: str
+    """Label of the quantity."""
     index: Ints
+    """Numbers of the readings. Shape (n,)."""
     place: Floats
+    """Coordinates of the readings along the line, increasing. Shape (n,)."""
     axis: str
+    """Name of the coordinate, with its unit."""
 
 
 def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:

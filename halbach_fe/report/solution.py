@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, along_the_axis
 from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows, stray_title
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
@@ -105,6 +105,8 @@ def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
         return ("Choose where to measure it." if _smallest_noise(solution) else
                 "Add [[noise.regions]] to the study, and choose where to measure it.",
                 "halbach-fe plan STUDY -o DIR")
+    if solution.magnet.cancels_along_z and not solution.magnet.study.homogeneity:
+        return along_the_axis(solution.magnet)
     if solution.magnet.dimension == 2 or solution.magnet.array.multipole_order > 1:
         return ("See its multipoles, with what the tolerances of the blocks make of them.",
                 "halbach-fe multipoles STUDY -o DIR")

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.core.arrays import slices
 from halbach_fe.design.assembly import turn_in_words
 from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.ring_catalogue import obstacle
@@ -91,8 +92,7 @@ def place_table(found: SortedBlocks) -> Rows:
     for ring in np.unique(table.ring).tolist():
         mine = np.flatnonzero(table.ring == ring)
         mine = mine[np.argsort(table.slot[mine], kind="stable")]
-        for first in range(0, len(mine), slots_a_row):
-            some = mine[first:first + slots_a_row]
+        for some in (mine[part] for part in slices(len(mine), slots_a_row)):
             rows.append({"ring": str(ring), "slots": f"{table.slot[some[0]]} to "
                          f"{table.slot[some[-1]]}" if len(some) > 1 else str(table.slot[some[0]]),
                          "blocks, slot by slot": ", ".join(table.serial[row] for row in some)})

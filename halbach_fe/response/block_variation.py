@@ -26,12 +26,13 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints, radii_of
+from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -50,23 +51,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Variations:
-    """The variations inside the blocks of a magnet, as polarizations of cells.
-
-    Attributes
-    ----------
-    interaction : Interaction
-    starts : ndarray of int, shape (blocks + 1,)
-        Number of the first cell of every block.
-    polarization : tuple of ndarray, shape (cells of a block, q, 3, modes), in T
-        For every block the polarization of the parts of its cells per amplitude.
-    names : tuple of str
-        Names of all amplitudes, block by block, such as ``r01s05.v03``.
-    """
+    """The variations inside the blocks of a magnet, as polarizations of cells."""
 
     interaction: Interaction
     starts: Ints
+    """Number of the first cell of every block. Shape (blocks + 1,)."""
     polarization: tuple[Floats, ...]
+    """For every block the polarization of the parts of its cells per amplitude.
+    Shape (cells of a block, q, 3, modes), in T."""
     names: tuple[str, ...]
+    """Names of all amplitudes, block by block, such as ``r01s05.v03``."""
 
     @classmethod
     def of(cls, magnet: Magnet) -> Variations | None:
@@ -151,7 +145,7 @@ class Variations:
         # number of field components of parts at points that are in memory at a time, 240 MB
         numbers_at_once = 30_000_000
         step = max(1, numbers_at_once // (9 * self.interaction.cells.weights.size))
-        return (every[first:first + step] for first in range(0, len(every), step))
+        return (every[part] for part in slices(len(every), step))
 
     def _of_amplitudes(self, by_part: Floats) -> Floats:
         """Return values (r, amplitudes) per amplitude of those (r, parts 3) per polarization."""
@@ -223,9 +217,11 @@ def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
         turn = rotation_about_z(np.radians(one.turn_deg))
         local = (points - [0.0, 0.0, one.z_m]) @ turn
         own = np.zeros((root.shape[1], *points.shape))
-        for number, unit in enumerate(unit_fields(magnet.blocks, local)):
-            own += np.moveaxis(unit @ root[3 * number:3 * number + 3], -1, 0)
-        found.append(MU_0 * one.factor * own @ turn.T)
+        for number, (block, unit) in enumerate(zip(
+                magnet.blocks, unit_fields(magnet.blocks, local), strict=True)):
+            remanence = MU_0 * block.recoil_tensor @ root[3 * number:3 * number + 3]
+            own += np.moveaxis(unit @ remanence, -1, 0)
+        found.append(one.factor * own @ turn.T)
     return np.concatenate(found)
 
 
@@ -256,14 +252,15 @@ def amplitude_names(magnet: Magnet) -> tuple[str, ...]:
 
 def shared_deviations(magnet: Magnet) -> Floats:
     """Return the change (parameters, amplitudes) in A/m of the nominal magnetizations."""
-    return _changes(magnet, STEP, lambda other: other.nominal_magnetization)
+    return changes_by_amplitudes(magnet, lambda other: other.nominal_magnetization)
 
 
 def vacuum_changes(magnet: Magnet, points: Floats) -> Floats:
     """Return the change (amplitudes, n, 3) in T of the field of blocks in vacuum and of external
     sources at points (n, 3) in m, magnetizations changed as in `shared_deviations`.
     """
-    return _changes(magnet, STEP, lambda other: vacuum_part(other, points)).transpose(2, 0, 1)
+    return changes_by_amplitudes(magnet, lambda other: vacuum_part(other, points)).transpose(
+        2, 0, 1)
 
 
 def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -278,7 +275,7 @@ def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
     # step of the differences of what permeability and iron add, in standard deviations: large
     # enough for differences between meshes, which a small step would magnify
     solved_step = 0.1
-    return changes + _changes(magnet, solved_step, solved).transpose(2, 0, 1)
+    return changes + changes_by_amplitudes(magnet, solved, solved_step).transpose(2, 0, 1)
 
 
 def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:
@@ -297,7 +294,9 @@ def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:
                     stacked_root(sparse.csr_array(root)))
 
 
-def _changes(magnet: Magnet, step: float, of: Callable[[Magnet], Floats]) -> Floats:
+def changes_by_amplitudes(
+    magnet: Magnet, of: Callable[[Magnet], NDArray[Any]], step: float = STEP
+) -> NDArray[Any]:
     """Return the derivatives (..., amplitudes), per standard deviation, of values of a magnet."""
     found = []
     for one in magnet.study.uncertain_of_magnet:
@@ -393,13 +392,7 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Deviations:
-    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    variations : Variations or None
-    """
+    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks."""
 
     magnet: Magnet
     variations: Variations | None

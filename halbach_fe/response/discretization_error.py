@@ -107,7 +107,7 @@ def error_bars(observation: Observation, parts: ElementFields, changes: Floats) 
 def discretization_changes(
     magnet: Magnet, points: Floats, parts: ElementFields, session: Session
 ) -> Floats:
-    """Return the changes of the field that other discretizations make, with their signs.
+    """Return the signed changes (k, n, 3) in T of the field that other discretizations make.
 
     Each is as large as the error that it stands for, at all points together. On a 3D mesh the other
     discretization is the dual formulation on the same mesh: the energies of the two formulations
@@ -119,16 +119,11 @@ def discretization_changes(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     parts : ElementFields
         The finite-element part of the field at the points.
     session : Session
         The additional solves have a subfolder of its folder.
-
-    Returns
-    -------
-    ndarray, shape (k, n, 3), in T
     """
     nominal, known = parts.nominal, parts.error
     if known is not None:
@@ -195,25 +190,17 @@ FLATTEST, STEEPEST = 0.5, 4.0
 
 @dataclass(frozen=True)
 class Difference:
-    """Largest differences between two solves, relative to the largest field.
-
-    Attributes
-    ----------
-    what : str
-        Description of the two solves that are compared.
-    pointwise : float
-        Largest |difference of B| at any point.
-    fourier : float or None
-        Largest difference of the Fourier coefficients of B_r; None if the study's positions are not
-        circles.
-    by_region : dict of str to float
-        Largest |difference of B| at any point of each noise region.
-    """
+    """Largest differences between two solves, relative to the largest field."""
 
     what: str
+    """Description of the two solves that are compared."""
     pointwise: float
+    """Largest |difference of B| at any point."""
     fourier: float | None
+    """Largest difference of the Fourier coefficients of B_r; None if the study's positions are not
+    circles."""
     by_region: dict[str, float]
+    """Largest |difference of B| at any point of each noise region."""
 
 
 @dataclass(frozen=True)

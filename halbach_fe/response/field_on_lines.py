@@ -119,21 +119,14 @@ class Lines:
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivative of B along u on lines; nan of those that have no air beside them.
-
-    Attributes
-    ----------
-    values : ndarray, shape (lines, count, 3, 1 + q), in T/m
-        Mean and root.
-    error : ndarray, shape (lines, count, 3), in T/m
-        Error bar of the finite elements and the difference.
-    spacing : ndarray, shape (lines,), in T
-        Error that the spacing of the points makes of its integral.
-    """
+    """Derivative of B along u on lines; nan of those that have no air beside them."""
 
     values: Floats
+    """Mean and root. Shape (lines, count, 3, 1 + q), in T/m."""
     error: Floats
+    """Error bar of the finite elements and the difference. Shape (lines, count, 3), in T/m."""
     spacing: Floats
+    """Error that the spacing of the points makes of its integral. Shape (lines,), in T."""
 
 
 @dataclass(frozen=True)
@@ -278,11 +271,8 @@ def field_on_lines(
 
     Parameters
     ----------
-    magnet : Magnet
-    lines : Lines
     magnetizations : Gaussian
         Of all parameters of the response matrix.
-    session : Session
     inside : bool
         Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
 
@@ -330,23 +320,17 @@ def field_on_lines(
 
 @dataclass(frozen=True)
 class _Beside:
-    """Lines close beside others, in the air, for the derivative of B along u.
-
-    Attributes
-    ----------
-    points : ndarray, shape (offsets * m, count, 3), in m
-        Of the lines at every multiple of the step of `offsets`.
-    number : ndarray of int, shape (m,)
-        Which of the lines have air beside them.
-    step : ndarray, shape (m,), in m
-    offsets : tuple of int
-        +1, -1 for exact fields, and +2, -2 besides for those of finite elements.
-    """
+    """Lines close beside others, in the air, for the derivative of B along u."""
 
     points: Floats
+    """Of the lines at every multiple of the step of `offsets`.
+    Shape (offsets * m, count, 3), in m."""
     number: NDArray[np.intp]
+    """Which of the lines have air beside them. Shape (m,)."""
     step: Floats
+    """Shape (m,), in m."""
     offsets: tuple[int, ...]
+    """+1, -1 for exact fields, and +2, -2 besides for those of finite elements."""
 
     @classmethod
     def of(cls, magnet: Magnet, lines: Lines) -> _Beside:
@@ -384,8 +368,6 @@ class _Beside:
 
         Parameters
         ----------
-        magnet : Magnet
-        lines : Lines
         flux : ndarray, shape (offsets * m, count, 3, 1 + q), in T
             Mean and root of B at `points`.
         error : ndarray, shape (lines, count, 3), in T
@@ -502,10 +484,7 @@ def _through_blocks(
     the deviations of the blocks too; what their permeability adds is an error bar, chi times that
     field.
 
-    Raises
-    ------
-    StudyError
-        If blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
+    StudyError if blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
     """
     blocks = magnet.blocks
     in_iron = number >= len(blocks)

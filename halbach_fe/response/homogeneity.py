@@ -348,23 +348,16 @@ def _cylinder_surface(degree: int) -> Floats:
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A spherical harmonic of the component along the mean field.
-
-    Attributes
-    ----------
-    degree, order : int
-    letter : str
-        ``a`` for cos(m phi), ``b`` for sin(m phi).
-    ppm, sd_ppm : float
-        Amplitude on the surface of the sphere relative to the mean field, and its standard
-        deviation.
-    """
+    """A spherical harmonic of the component along the mean field."""
 
     degree: int
     order: int
     letter: str
+    """``a`` for cos(m phi), ``b`` for sin(m phi)."""
     ppm: float
     sd_ppm: float
+    """Amplitude on the surface of the sphere relative to the mean field, and its standard
+    deviation."""
 
     @property
     def name(self) -> str:
@@ -375,95 +368,66 @@ class Harmonic:
 
 @dataclass(frozen=True)
 class Homogeneity:
-    """The field in a region for one distribution of magnetizations.
-
-    Attributes
-    ----------
-    mean_T, mean_sd_T : float
-        Mean of |B| over the volume, for the mean magnetizations, and its standard deviation.
-    direction : ndarray, shape (3,)
-        Direction of the mean of B.
-    direction_sd_rad : float
-        Standard deviation of its angle, rms over the two directions across it.
-    rms_ppm, peak_to_peak_ppm : float
-        Of the field of the mean magnetizations; of what was measured the medians of the ranges:
-        the mean field lacks what is not known, so that it may be below all that is likely.
-    rms_range_ppm, peak_to_peak_range_ppm : tuple of float
-        Quantiles 2.5, 50 and 97.5 % of magnets that are drawn from the distribution. They are
-        larger than those of the mean field if the distribution is wide, as that of magnets whose
-        blocks were not measured.
-    harmonics : tuple of Harmonic
-        Empty unless the region is a sphere.
-    components : str
-        Names of the components whose size stands for |B|, if the others were not measured, or
-        ``|B|`` if it was measured alone; there is no direction then.
-    """
+    """The field in a region for one distribution of magnetizations."""
 
     mean_T: float
     mean_sd_T: float
+    """Mean of |B| over the volume, for the mean magnetizations, and its standard deviation."""
     direction: Floats
+    """Direction of the mean of B. Shape (3,)."""
     direction_sd_rad: float
+    """Standard deviation of its angle, rms over the two directions across it."""
     rms_ppm: float
     peak_to_peak_ppm: float
+    """Of the field of the mean magnetizations; of what was measured the medians of the ranges: the
+    mean field lacks what is not known, so that it may be below all that is likely."""
     rms_range_ppm: tuple[float, float, float]
     peak_to_peak_range_ppm: tuple[float, float, float]
+    """Quantiles 2.5, 50 and 97.5 % of magnets that are drawn from the distribution. They are larger
+    than those of the mean field if the distribution is wide, as that of magnets whose blocks were
+    not measured."""
     harmonics: tuple[Harmonic, ...]
+    """Empty unless the region is a sphere."""
     components: str = ""
+    """Names of the components whose size stands for |B|, if the others were not measured, or
+    ``|B|`` if it was measured alone; there is no direction then."""
 
 
 @dataclass(frozen=True)
 class Slice:
-    """|B| in a plane through the centre of a region.
-
-    Attributes
-    ----------
-    across : str
-        The axis that is normal to the plane.
-    first_m, second_m : ndarray, shape (k,)
-        Coordinates along the other axes, in the order of x, y and z.
-    size_T : ndarray, shape (k, k)
-        |B|, with the second axis along the rows; NaN inside material.
-    """
+    """|B| in a plane through the centre of a region."""
 
     across: str
+    """The axis that is normal to the plane."""
     first_m: Floats
     second_m: Floats
+    """Coordinates along the other axes, in the order of x, y and z. Shape (k,)."""
     size_T: Floats
+    """|B|, with the second axis along the rows; NaN inside material. Shape (k, k)."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Points of a region at which its field is computed.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), in m
-        Those of the surface, of the volume, and more of the surface where blocks are near.
-    weights : ndarray, shape (n,)
-        Of means over the volume; 0 on the surface.
-    steps : ndarray, shape (n, 3)
-        Distance of each point from those next to it, relative to the half axes.
-    surface : int
-        Number of points on the surface, or on a sphere within it, that come first.
-    degree : int
-        Degree of the functions that these resolve, see `Region.points`.
-    unresolved_m : float
-        Distance in m at which blocks are too near for the points; 0 if none is.
-    inner_radius : float
-        Radius of the first points relative to that of the region: less than 1 if they are on a
-        sphere within it, because blocks are too near for those on the surface.
-    near_shims : bool
-        Whether shims are so near that these points are denser about them.
-    """
+    """Points of a region at which its field is computed."""
 
     points: Floats
+    """Those of the surface, of the volume, and more of the surface where blocks are near.
+    Shape (n, 3), in m."""
     weights: Floats
+    """Of means over the volume; 0 on the surface. Shape (n,)."""
     steps: Floats
+    """Distance of each point from those next to it, relative to the half axes. Shape (n, 3)."""
     surface: int
+    """Number of points on the surface, or on a sphere within it, that come first."""
     degree: int
+    """Degree of the functions that these resolve, see `Region.points`."""
     unresolved_m: float = 0.0
+    """Distance in m at which blocks are too near for the points; 0 if none is."""
     inner_radius: float = 1.0
+    """Radius of the first points relative to that of the region: less than 1 if they are on a
+    sphere within it, because blocks are too near for those on the surface."""
     near_shims: bool = False
+    """Whether shims are so near that these points are denser about them."""
 
     @property
     def doubt(self) -> str:
@@ -476,29 +440,20 @@ class Sampling:
 
 @dataclass(frozen=True)
 class HomogeneityModel:
-    """The linear model of B at the points of a region and of three slices through it.
-
-    Attributes
-    ----------
-    region : Region
-    points : ndarray, shape (m, 3), in m
-        Those of the region, followed by those of the slices that are in air.
-    sampling : Sampling
-        Those of the region.
-    in_air : ndarray of bool, shape (3 SLICE^2,)
-        Which points of the slices are among those of the response, after the region's.
-    response : Response
-        Of Bx, By and Bz at each point.
-    degrees : int
-        Largest degree of the harmonics.
-    """
+    """The linear model of B at the points of a region and of three slices through it."""
 
     region: Region
     points: Floats
+    """Those of the region, followed by those of the slices that are in air. Shape (m, 3), in m."""
     sampling: Sampling
+    """Those of the region."""
     in_air: Bools
+    """Which points of the slices are among those of the response, after the region's.
+    Shape (3 SLICE^2,)."""
     response: Response
+    """Of Bx, By and Bz at each point."""
     degrees: int
+    """Largest degree of the harmonics."""
 
     @property
     def weights(self) -> Floats:
@@ -607,7 +562,6 @@ def extremes(
 
     Parameters
     ----------
-    region : Region
     points : ndarray, shape (n, 3), in m
     steps : ndarray, shape (n, 3)
         Distance of each point from those next to it, relative to the half axes.

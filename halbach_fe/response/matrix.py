@@ -59,20 +59,13 @@ LOADED_BYTES = 2**30
 
 @dataclass(frozen=True)
 class StoredMatrix:
-    """A matrix in a .npy file, of which only the rows in use are in memory.
-
-    Attributes
-    ----------
-    path : Path
-    shape : tuple of int
-        Numbers of rows and columns.
-    sha256 : str
-        SHA-256 of the file as it was written.
-    """
+    """A matrix in a .npy file, of which only the rows in use are in memory."""
 
     path: Path
     shape: tuple[int, int]
+    """Numbers of rows and columns."""
     sha256: str
+    """SHA-256 of the file as it was written."""
 
     @classmethod
     def of(cls, parts: Iterable[Floats], shape: tuple[int, int], path: Path) -> StoredMatrix:
@@ -128,44 +121,31 @@ def _npy_header(shape: tuple[int, int]) -> bytes:
 
 @dataclass(frozen=True)
 class Response:
-    """The linear model ``q = offset + H p`` from magnetizations p to readings q.
-
-    Attributes
-    ----------
-    matrix : ndarray or StoredMatrix, shape (readings, parameters), in T m/A
-        The response matrix H.
-    parameters : tuple of str
-        Names of the parameters; ``r01s05.Mx`` is M_x of ring 1, slot 5.
-    nominal : ndarray, shape (parameters,), in A/m
-        The study's nominal magnetization.
-    offset : ndarray, shape (readings,), in T
-        Readings of external fields, and with non-linear iron also the constant term of the
-        linearization.
-    error : ndarray, shape (readings,), in T
-        Error bar of the finite elements, for the nominal array; see
-        `halbach_fe.response.discretization_error.reading_errors`.
-    shared_error : ndarray, shape (k, readings), in T
-        The changes of all readings together that `error` is made of, with their signs; see
-        `halbach_fe.response.discretization_error.discretization_changes`.
-    superposition_error : float
-        Relative difference between the sum of the blocks' finite-element parts and that of the
-        whole array, see `superposition_error`.
-    of_similar : bool
-        Whether the finite-element part of the columns is that of a similar magnet, see
-        `response_matrix`.
-    reused : bool
-        Whether the response was read from the file of an earlier run with the same inputs.
-    """
+    """The linear model ``q = offset + H p`` from magnetizations p to readings q."""
 
     matrix: Floats | StoredMatrix
+    """The response matrix H. Shape (readings, parameters), in T m/A."""
     parameters: tuple[str, ...]
+    """Names of the parameters; ``r01s05.Mx`` is M_x of ring 1, slot 5."""
     nominal: Floats
+    """The study's nominal magnetization. Shape (parameters,), in A/m."""
     offset: Floats
+    """Readings of external fields, and with non-linear iron also the constant term of the
+    linearization. Shape (readings,), in T."""
     error: Floats
+    """Error bar of the finite elements, for the nominal array; see
+    `halbach_fe.response.discretization_error.reading_errors`. Shape (readings,), in T."""
     superposition_error: float
+    """Relative difference between the sum of the blocks' finite-element parts and that of the whole
+    array, see `superposition_error`."""
     of_similar: bool = False
+    """Whether the finite-element part of the columns is that of a similar magnet, see
+    `response_matrix`."""
     reused: bool = False
+    """Whether the response was read from the file of an earlier run with the same inputs."""
     shared_error: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """The changes of all readings together that `error` is made of, with their signs; see
+    `halbach_fe.response.discretization_error.discretization_changes`. Shape (k, readings), in T."""
 
     @property
     def whole(self) -> Floats:
@@ -178,16 +158,10 @@ def response_matrix(
 ) -> Response:
     """Build H, or read it from the session's folder if it was built for the same inputs.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    observation : Observation
-    session : Session
-    similar : Magnet, optional
-        A magnet whose shapes or materials differ slightly, and which was solved for before with the
-        session's cache. What its permeability and iron add to the field of single blocks, which
-        takes most of the time, serves this magnet too if it adds up to the nominal array to
-        5e-4. The nominal array and the field in vacuum are computed in any case.
+    ``similar``: a magnet whose shapes or materials differ slightly, and which was solved for before
+    with the session's cache. What its permeability and iron add to the field of single blocks,
+    which takes most of the time, serves this magnet too if it adds up to the nominal array to 5e-4.
+    The nominal array and the field in vacuum are computed in any case.
 
     Raises
     ------
@@ -244,8 +218,8 @@ def _similar_response(
     error = discretization_changes(similar, observation.points, parts, own)
     nominal = finite_element_part(magnet, observation.points, session, columns=False).nominal
     built = _assemble(magnet, observation, replace(
-        parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
-        error, path, changes)
+        parts, nominal=nominal, along_nominal=parts.along_nominal + nominal - parts.nominal,
+        sources=magnet.blocks, for_deviations=True), error, path, changes)
     # tolerance of the check that columns of a similar magnet add up to the nominal array. Readings
     # of blocks that deviate by 1 % are then wrong by 2e-6 of the largest reading: measured 1.3e-7
     # at a difference of 3.6e-5, by another inner radius in an iron tube.

@@ -39,7 +39,7 @@ from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import Deviations
+from halbach_fe.response.block_variation import Deviations, changes_by_amplitudes
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
@@ -106,39 +106,29 @@ class MultipoleReference:
 
 @dataclass(frozen=True)
 class Multipoles:
-    """The multipoles of a magnet, with their uncertainty.
-
-    Attributes
-    ----------
-    orders : tuple of int, length k
-        Orders of the unwanted multipoles.
-    main, main_sd : float
-        Mean of |C_N| in T, or in T m if integrated along z, and its standard deviation, including
-        the solver's error.
-    roll, roll_sd : float
-        The same of the angle in rad by which the main multipole is turned about z from that of the
-        nominal magnet.
-    mean : ndarray, shape (2 k,)
-        Means of b_n of all orders, followed by those of a_n, in units of 1e-4 of the main one.
-    root : ndarray, shape (2 k, q)
-        Root of the covariance of these, in the same units.
-    error : ndarray, shape (2 k,)
-        Error of the solver for the nominal magnet in the same units, which ``root`` does not
-        include.
-    root_T : ndarray, shape (2 k, q), in T (integrated: T m)
-        Root of the covariance of B_n and A_n themselves, which are known where the main one, to
-        which ``root`` refers, is not.
-    """
+    """The multipoles of a magnet, with their uncertainty."""
 
     orders: tuple[int, ...]
+    """Orders of the unwanted multipoles. Length k."""
     main: float
     main_sd: float
+    """Mean of |C_N| in T, or in T m if integrated along z, and its standard deviation, including
+    the solver's error."""
     roll: float
     roll_sd: float
+    """The same of the angle in rad by which the main multipole is turned about z from that of the
+    nominal magnet."""
     mean: Floats
+    """Means of b_n of all orders, followed by those of a_n, in units of 1e-4 of the main one.
+    Shape (2 k,)."""
     root: Floats
+    """Root of the covariance of these, in the same units. Shape (2 k, q)."""
     error: Floats
+    """Error of the solver for the nominal magnet in the same units, which ``root`` does not
+    include. Shape (2 k,)."""
     root_T: Floats
+    """Root of the covariance of B_n and A_n themselves, which are known where the main one, to
+    which ``root`` refers, is not. Shape (2 k, q), in T (integrated: T m)."""
 
     @property
     def absolute(self) -> Multipoles:
@@ -200,45 +190,31 @@ class MultipoleModel:
     """The linear model ``C = offset + matrix p`` of the multipoles, with the main one first.
 
     C is in T, or in T m if integrated along z, and p are the magnetizations in A/m.
-
-    Attributes
-    ----------
-    orders : tuple of int, length k
-        Orders of the unwanted multipoles.
-    main : int
-        The magnet's main order N.
-    radius : float
-        Reference radius in m.
-    z : float or None
-        Position in m of the circle, in 3D; None in 2D and for the integral along z.
-    integrated : bool
-        Whether the field is integrated along z.
-    matrix : ndarray of complex, shape (1 + k, parameters), in T m/A (integrated: T m^2/A)
-        Rows for the main multipole and for ``orders``, along axes in which the nominal main
-        multipole is normal.
-    offset : ndarray of complex, shape (1 + k,), in T (integrated: T m)
-        Multipoles of external fields.
-    error : ndarray, shape (1 + k,), in T (integrated: T m)
-        Error bar of the solver for the moduli |C|.
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetization.
-    turn : float
-        Angle in rad of the axes about z.
-    left_out_T : tuple of 3 floats
-        Uniform field that the integral along z, which would be infinite, is without.
     """
 
     orders: tuple[int, ...]
+    """Orders of the unwanted multipoles. Length k."""
     main: int
+    """The magnet's main order N."""
     radius: float
+    """Reference radius in m."""
     z: float | None
+    """Position in m of the circle, in 3D; None in 2D and for the integral along z."""
     integrated: bool
+    """Whether the field is integrated along z."""
     matrix: Complexes
+    """Rows for the main multipole and for ``orders``, along axes in which the nominal main
+    multipole is normal. Shape (1 + k, parameters), in T m/A (integrated: T m^2/A)."""
     offset: Complexes
+    """Multipoles of external fields. Shape (1 + k,), in T (integrated: T m)."""
     error: Floats
+    """Error bar of the solver for the moduli |C|. Shape (1 + k,), in T (integrated: T m)."""
     nominal: Floats
+    """Nominal magnetization. Shape (parameters,), in A/m."""
     turn: float
+    """Angle in rad of the axes about z."""
     left_out_T: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Uniform field that the integral along z, which would be infinite, is without."""
 
     @property
     def unit(self) -> str:
@@ -358,12 +334,7 @@ def multipole_models(
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
-    """Refuse a reference circle of which points (n, 3) in m are not in air.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse a reference circle of which points (n, 3) in m are not in air."""
     if magnet.contains(points).any():
         bore = "" if magnet.has_bore else ", which has no bore there"
         raise StudyError(must_be(
@@ -374,12 +345,7 @@ def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
 
 
 def _check_no_source(magnet: Magnet, radius: float, z: float) -> None:
-    """Refuse a reference circle within which a coil or a dipole is: B_r has no multipoles there.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse a reference circle within which a coil or a dipole is: B_r has no multipoles there."""
     if source := _source_within(magnet, radius, z):
         raise StudyError(must_be(
             "the reference circle of multipoles", f"study {magnet.name}",
@@ -486,7 +452,6 @@ def solved_circles(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         The study's positions.
     flux_density : ndarray, shape (n, 3), in T
@@ -568,11 +533,8 @@ def _turn(
     ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C,
     and ``external`` what external fields add to it.
 
-    Raises
-    ------
-    StudyError
-        If the main multipole of the nominal magnet, with external fields or without, vanishes, or
-        is no larger than ``least_T``.
+    StudyError if the main multipole of the nominal magnet, with external fields or without,
+    vanishes, or is no larger than ``least_T``.
     """
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
@@ -654,28 +616,41 @@ def _along_all_z(
     size = summed.shape[1]
     matrix, offset = model.matrix[part].copy(), model.offset[part] - sources
     matrix[:, :size] -= summed
-    unknown = magnet.study.uncertain_of_magnet
-    for column, one in enumerate(unknown, matrix.shape[1] - len(unknown)):
-        uniform = [one.sd * one.change.get(f"external.background_T[{axis}]", 0.0)
-                   for axis in (1, 2, 3)]
-        matrix[:, column] -= observation.operator @ np.tile(uniform, len(observation.points))
+    amplitudes = magnet.study.uncertain_of_magnet
+    first = matrix.shape[1] - len(amplitudes)  # whose sources have integrals of their own, too
+    if amplitudes:
+        matrix[:, first:] -= observation.operator @ changes_by_amplitudes(
+            magnet, lambda other: external_field(other, observation.points)).reshape(
+                -1, len(amplitudes))
     near, far = complexes(matrix)
     offset_near, offset_far = complexes(offset)
     radius, highest = float(np.hypot(*observation.points[0, :2])), len(near)
     shapes, inexact = _integrals_of_shapes(magnet.blocks, radius, highest)
-    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
-    of_others, inexact_others = _integrals_of_shapes(others, radius, highest)
-    sources = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
-                  for one, shape in zip(others, of_others, strict=True))
-    coils, coils_error = _integrals_of_coils(magnet, radius, highest)
+    sources, sources_error = _integrals_of_sources(magnet, radius, highest)
     mesh = model.error[part].reshape(2, 2, -1).max(axis=1).sum(axis=0)
-    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + inexact_others + coils_error
+    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + sources_error
     total = near + far
+    if amplitudes:
+        total[:, first:] += changes_by_amplitudes(
+            magnet, lambda other: _integrals_of_sources(other, radius, highest)[0])
     tensors = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks])
     total[:, :size] += np.einsum("bk,bj->kbj", shapes, tensors[:, 0] + 1j * tensors[:, 1]).reshape(
         highest, size)
-    external = sources + coils
-    return total, offset_near + offset_far + external, error
+    return total, offset_near + offset_far + sources, error
+
+
+def _integrals_of_sources(
+    magnet: Magnet, radius: float, highest: int
+) -> tuple[Complexes, Floats]:
+    """Return C_n (K,) of external sources but a uniform field, integrated along all of z, and error
+    bars (K,), in T m.
+    """
+    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
+    shapes, inexact = _integrals_of_shapes(others, radius, highest)
+    of_others = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
+                    for one, shape in zip(others, shapes, strict=True))
+    coils, error = _integrals_of_coils(magnet, radius, highest)
+    return of_others + coils, inexact + error
 
 
 def _integrals_of_shapes(
@@ -705,7 +680,6 @@ def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: i
 
     Parameters
     ----------
-    block : MagnetBlock
     radius : float
         Reference radius in m.
     highest : int
@@ -752,10 +726,7 @@ def _integrals_of_coils(
 
     The error bar in T m of all comes second. The ``radius`` of the circle is in m.
 
-    Raises
-    ------
-    StudyError
-        If one of them is within the circle, at any z: then the integral has sources there.
+    StudyError if one of them is within the circle, at any z: then the integral has sources there.
     """
     external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
     if external == External():

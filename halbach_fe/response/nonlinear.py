@@ -34,7 +34,7 @@ import numpy as np
 import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
@@ -65,30 +65,20 @@ wrong sign or Gauss point makes a difference of 1e-4 T."""
 
 @dataclass(frozen=True)
 class NonlinearModel:
-    """The map from magnetizations p in A/m to readings in T; call an instance to evaluate it.
-
-    Attributes
-    ----------
-    condensed : Condensed
-        The problem condensed to the unknowns in the iron.
-    offset : ndarray, shape (readings,), in T
-        Readings of external fields.
-    parameters : tuple of str
-        Names of the parameters, as in `halbach_fe.response.matrix.Response`.
-    nominal : ndarray, shape (parameters,), in A/m
-        The study's nominal magnetization.
-    error : ndarray, shape (readings,), in T
-        Error bar of the finite elements, for the nominal array.
-    agreement_T : float
-        Largest difference from GetDP's Newton method in any reading of the verified samples.
-    """
+    """The map from magnetizations p in A/m to readings in T; call an instance to evaluate it."""
 
     condensed: Condensed
+    """The problem condensed to the unknowns in the iron."""
     offset: Floats
+    """Readings of external fields. Shape (readings,), in T."""
     parameters: tuple[str, ...]
+    """Names of the parameters, as in `halbach_fe.response.matrix.Response`."""
     nominal: Floats
+    """The study's nominal magnetization. Shape (parameters,), in A/m."""
     error: Floats
+    """Error bar of the finite elements, for the nominal array. Shape (readings,), in T."""
     agreement_T: float
+    """Largest difference from GetDP's Newton method in any reading of the verified samples."""
 
     def __call__(self, magnetizations: Floats, tolerance_T: float = 1e-9) -> Floats:
         """Return the readings (..., readings) in T of magnetizations (..., parameters) in A/m.
@@ -113,8 +103,6 @@ def nonlinear_model(
 
     Parameters
     ----------
-    magnet : Magnet
-    observation : Observation
     session : Session
         Its folder receives the runs of GetDP.
     generator : numpy.random.Generator
@@ -215,20 +203,13 @@ def newton_readings(
     magnet: Magnet, observation: Observation, session: Session, magnetizations: Floats,
     cold: bool = False,
 ) -> Floats:
-    """Return the readings of magnetizations by GetDP's own Newton method.
+    """Return the readings (k, readings) in T of magnetizations by GetDP's own Newton method.
 
     Parameters
     ----------
-    magnet : Magnet
-    observation : Observation
-    session : Session
     magnetizations : ndarray, shape (k, parameters), in A/m
     cold : bool
         Start Newton's method from zero for every sample, instead of from the sample before.
-
-    Returns
-    -------
-    ndarray, shape (k, readings), in T
     """
     size = magnet.dimension
     samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
@@ -296,10 +277,7 @@ def _check_iron(
 ) -> None:
     """Check that GetDP's matrix inside the iron equals that assembled from our Gauss points.
 
-    Raises
-    ------
-    GetDPError
-        If the two matrices differ.
+    GetDPError if the two matrices differ.
     """
     size = gradient.shape[0] // len(weights)
     ours = vacuum * (gradient.T @ (sparse.diags_array(np.tile(weights, size)) @ gradient))
@@ -315,21 +293,14 @@ MAX_NEWTON_STEPS = 60
 
 @dataclass(frozen=True)
 class Statistics:
-    """Convergence of a solve.
-
-    Attributes
-    ----------
-    iterations : int
-        Accelerated iterations.
-    newton_steps : int
-        Newton steps after them, 0 if the accelerated iteration converged.
-    residuals : tuple of float
-        Residual of every iterate, relative to the sources.
-    """
+    """Convergence of a solve."""
 
     iterations: int
+    """Accelerated iterations."""
     newton_steps: int
+    """Newton steps after them, 0 if the accelerated iteration converged."""
     residuals: tuple[float, ...]
+    """Residual of every iterate, relative to the sources."""
 
 
 @dataclass(frozen=True)
@@ -338,38 +309,28 @@ class Condensed:
 
     The letters are those of the equations at the top of this module. The unknowns are nodal values
     of the potential in T m, or circulations along edges in T m^2.
-
-    Attributes
-    ----------
-    law : ConstitutiveLaw
-        The iron's law c(|F|^2).
-    gradient : sparse array, shape (d m, unknowns)
-        G. The field in T at m Gauss points in d dimensions, component after component.
-    weights : ndarray, shape (m,), in m^d
-        w.
-    stiffness : sparse array, shape (unknowns, unknowns)
-        S, with the iron replaced by vacuum.
-    potential : ndarray, shape (unknowns, parameters)
-        U, the potential without the iron per A/m.
-    linear : ndarray, shape (readings, parameters), in T m/A
-        Q0, the readings without the iron.
-    surface : ndarray, shape (s,)
-        The unknowns on which the readings depend.
-    readings : ndarray, shape (readings, s)
-        The columns of Q for ``surface``; all others are zero. Q d is in T.
-    reference : ndarray, shape (parameters,), in A/m
-        Magnetization about which the model is linearized, usually the nominal one.
     """
 
     law: ConstitutiveLaw
+    """The iron's law c(|F|^2)."""
     gradient: sparse.csr_array
+    """G. The field in T at m Gauss points in d dimensions, component after component.
+    Shape (d m, unknowns)."""
     weights: Floats
+    """w. Shape (m,), in m^d."""
     stiffness: sparse.csr_array
+    """S, with the iron replaced by vacuum. Shape (unknowns, unknowns)."""
     potential: Floats
+    """U, the potential without the iron per A/m. Shape (unknowns, parameters)."""
     linear: Floats
+    """Q0, the readings without the iron. Shape (readings, parameters), in T m/A."""
     surface: Ints
+    """The unknowns on which the readings depend. Shape (s,)."""
     readings: Floats
+    """The columns of Q for ``surface``; all others are zero. Q d is in T. Shape (readings, s)."""
     reference: Floats
+    """Magnetization about which the model is linearized, usually the nominal one.
+    Shape (parameters,), in A/m."""
     _state: _Reference = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -593,21 +554,14 @@ class Condensed:
 
 @dataclass(frozen=True)
 class _Reference:
-    """The solution at the reference magnetization.
-
-    Attributes
-    ----------
-    added : ndarray, shape (unknowns,)
-        d, the contribution of the iron.
-    tangent : SuperLU
-        The factorized tangent.
-    slope : ndarray, shape (unknowns, parameters)
-        dd/dp.
-    """
+    """The solution at the reference magnetization."""
 
     added: Floats
+    """d, the contribution of the iron. Shape (unknowns,)."""
     tangent: sparse_linalg.SuperLU
+    """The factorized tangent."""
     slope: Floats
+    """dd/dp. Shape (unknowns, parameters)."""
 
 
 def condense(
@@ -644,8 +598,7 @@ def condense(
     condensed = np.empty((outputs.shape[0], len(surface)))
     coupling, other_outputs = coupling[:, surface], outputs[:, rest]
     step = 256  # number of columns that `condense` solves for at a time, which limits its memory
-    for first in range(0, len(surface), step):
-        part = slice(first, first + step)
+    for part in slices(len(surface), step):
         solved = inner.solve(coupling[:, part].toarray())
         schur[:, part] = coupling.T @ solved
         condensed[:, part] = own[:, surface[part]].toarray() - other_outputs @ solved

@@ -115,76 +115,53 @@ COARSER = {"cross_section": "enlarge mesh.block_size_m",
 
 @dataclass(frozen=True)
 class Problem:
-    """Runs of GetDP that are equal in size.
-
-    Attributes
-    ----------
-    what : str
-        Purpose of the mesh; all runs on the same mesh may go side by side.
-    route : str
-        Formulation, see `halbach_fe.solver.routes.choose_route`.
-    elements, unknowns : int
-        Numbers of elements and unknowns of each run.
-    processes : int
-        Number of runs, each of which is a GetDP process.
-    matrices, solves : int
-        Numbers of matrices that each process factorizes (or prepares for iterations), and of linear
-        systems that it solves.
-    memory_GiB, seconds, disk_GiB : float
-        Peak memory of each process, its time alone on a core, and the size of its run folder.
-    """
+    """Runs of GetDP that are equal in size."""
 
     what: str
+    """Purpose of the mesh; all runs on the same mesh may go side by side."""
     route: str
+    """Formulation, see `halbach_fe.solver.routes.choose_route`."""
     elements: int
     unknowns: int
+    """Numbers of elements and unknowns of each run."""
     processes: int
+    """Number of runs, each of which is a GetDP process."""
     matrices: int
     solves: int
+    """Numbers of matrices that each process factorizes (or prepares for iterations), and of linear
+    systems that it solves."""
     memory_GiB: float
     seconds: float
     disk_GiB: float
+    """Peak memory of each process, its time alone on a core, and the size of its run folder."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The memory, time and disk that a run of the command line is expected to need.
-
-    Attributes
-    ----------
-    study : str
-        Name of the study.
-    route : str
-        Formulation of the study's own solve, or ``exact_field_only`` if the exact field needs no
-        finite elements.
-    blocks, readings, parameters : int
-        Sizes of the problem; the number of parameters is 0 if there is no inference.
-    jobs : int
-        Number of GetDP processes that run at a time.
-    problems : tuple of Problem
-        Runs of GetDP, in the order in which they are solved.
-    own_memory_GiB : float
-        Peak memory of this program.
-    memory_GiB : float
-        Peak memory of this program and of the GetDP processes that run at a time.
-    disk_GiB, seconds : float
-        Disk space and time of the whole run.
-    available_GiB : float or None
-        Memory that the machine has left; None if it is not known.
-    """
+    """The memory, time and disk that a run of the command line is expected to need."""
 
     study: str
+    """Name of the study."""
     route: str
+    """Formulation of the study's own solve, or ``exact_field_only`` if the exact field needs no
+    finite elements."""
     blocks: int
     readings: int
     parameters: int
+    """Sizes of the problem; the number of parameters is 0 if there is no inference."""
     jobs: int
+    """Number of GetDP processes that run at a time."""
     problems: tuple[Problem, ...]
+    """Runs of GetDP, in the order in which they are solved."""
     own_memory_GiB: float
+    """Peak memory of this program."""
     memory_GiB: float
+    """Peak memory of this program and of the GetDP processes that run at a time."""
     disk_GiB: float
     seconds: float
+    """Disk space and time of the whole run."""
     available_GiB: float | None
+    """Memory that the machine has left; None if it is not known."""
 
     @property
     def processes(self) -> int:

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import vector
@@ -48,40 +48,28 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Reach:
-    """The largest distance at which |B| reaches the limit.
-
-    Attributes
-    ----------
-    distance_m : float
-        From the z axis, or from the plane z = 0.
-    sd_m : float
-        Its standard deviation, linearized; 0 for the nominal magnet.
-    at_m : tuple of float
-        The point.
-    """
+    """The largest distance at which |B| reaches the limit."""
 
     distance_m: float
+    """From the z axis, or from the plane z = 0."""
     sd_m: float
+    """Its standard deviation, linearized; 0 for the nominal magnet."""
     at_m: tuple[float, float, float]
+    """The point."""
 
 
 @dataclass(frozen=True)
 class StrayPlane:
-    """|B| outside of the magnet in a plane through its middle.
-
-    Attributes
-    ----------
-    across : str
-        The axis that is normal to the plane.
-    first_m, second_m, size_T : ndarray, shape (k, m)
-        Coordinates along the other axes, in the order of x, y and z, and |B|: k curves around the
-        magnet, from the nearest outwards, of which the last point is the first one again.
-    """
+    """|B| outside of the magnet in a plane through its middle."""
 
     across: str
+    """The axis that is normal to the plane."""
     first_m: Floats
     second_m: Floats
     size_T: Floats
+    """Coordinates along the other axes, in the order of x, y and z, and |B|: k curves around the
+    magnet, from the nearest outwards, of which the last point is the first one again.
+    Shape (k, m)."""
 
 
 @dataclass(frozen=True)
@@ -193,19 +181,45 @@ def stray_field(
 
 
 def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) -> Field:
-    """Return the field of a magnet alone, of the mean magnetizations."""
-    blocks = magnet.blocks
+    """Return the field of a magnet alone, of the mean of all parameters."""
+    blocks, others = magnet.blocks, np.zeros(0)
+    deviations, own = _deviations_alone(magnet)
     if magnetizations is not None:
         distribution_of(magnet, magnetizations, "magnetizations")
-        uniform = magnetizations.mean[:len(magnet.parameter_names)]
-        blocks = with_magnetizations(magnet, uniform)
-    vacuum = field_in_vacuum(blocks)
+        uniform = slice(0, len(magnet.parameter_names))
+        blocks, others = with_magnetizations(
+            magnet, magnetizations.mean[uniform]), magnetizations.mean[own]
+        others[uniform] = 0.0
+    of_blocks = field_in_vacuum(blocks)
+
+    def vacuum(points: Floats) -> Floats:
+        found = of_blocks(points)
+        return found + deviations.field(others, points) if others.any() else found
+
     if magnet.is_vacuum:
         return vacuum
     alone = magnet.with_(external=External())
-    coarse = alone if magnet.has_losses else alone.with_(mesh__cells_per_side=1)
-    reaction = solve_separate(coarse, session.within("stray"), estimate=False)
+    # beside iron of any shape as for the readings: without other sources that is solved already
+    as_readings = not magnet.iron_is_axisymmetric
+    reaction = solve_separate(
+        alone if magnet.has_losses or as_readings else alone.with_(mesh__cells_per_side=1),
+        session.within("stray"), estimate=as_readings)
     return lambda points: vacuum(points) + reaction.field(points)
+
+
+def _deviations_alone(magnet: Magnet) -> tuple[Deviations, Ints]:
+    """Return the deviations of a magnet without external sources, and the numbers of their
+    parameters among those of the magnet.
+    """
+    amplitudes = magnet.study.uncertain_of_magnet
+    changes = [{name: change for name, change in one.change.items()
+                if not name.startswith("external.")} for one in amplitudes]
+    alone = magnet.with_(external=External(), uncertain=tuple(
+        one.with_(change=change) for one, change in zip(amplitudes, changes, strict=True)
+        if change))
+    first = Deviations.of(magnet).count - len(amplitudes)
+    return Deviations.of(alone), np.append(np.arange(first), first + np.flatnonzero(
+        [bool(change) for change in changes])).astype(int)
 
 
 def _farthest(
@@ -290,7 +304,9 @@ def _sd(
     step = 1e-3 * float(np.linalg.norm(point))
     there = field(point + step * np.outer([-1.0, 0.0, 1.0], direction))
     inner, size, outer = np.linalg.norm(there, axis=1)
-    row = there[1] / size @ Deviations.of(magnet).columns(point[None])
+    deviations, own = _deviations_alone(magnet)
+    row = np.zeros(len(magnetizations.mean))
+    row[own] = there[1] / size @ deviations.columns(point[None])
     return float(magnetizations.sd_of(row[None])[0] * 2 * step / abs(inner - outer))
 
 

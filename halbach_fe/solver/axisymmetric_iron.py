@@ -98,27 +98,19 @@ class WithBar:
 
 @dataclass(frozen=True)
 class IronReaction(WithBar):
-    """The field that iron adds to that of its sources; `solve_iron` returns it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the study.
-    problem : Problem
-    total, reaction : ndarray, shape (modes, iron, 1), in T m
-        The total potential in the iron, and the part that the iron adds.
-    residuals : tuple of float
-        Relative residual of Newton's method at the start and after every step.
-    coarse : IronReaction or None
-        The solution with a coarser mesh, fewer modes and a nearer boundary, for the error bar.
-    """
+    """The field that iron adds to that of its sources; `solve_iron` returns it."""
 
     name: str
+    """Name of the study."""
     problem: Problem
     total: Complexes
     reaction: Complexes
+    """The total potential in the iron, and the part that the iron adds.
+    Shape (modes, iron, 1), in T m."""
     residuals: tuple[float, ...]
+    """Relative residual of Newton's method at the start and after every step."""
     coarse: IronReaction | None
+    """The solution with a coarser mesh, fewer modes and a nearer boundary, for the error bar."""
     _continued: dict[int, Complexes] = field(default_factory=dict, repr=False)
 
     def field(self, points: Floats) -> Floats:
@@ -160,7 +152,7 @@ class IronReaction(WithBar):
         self, sources: Sequence[Source] | Floats, points: Floats, inside: Floats | None = None,
         modes: int = TANGENT_MODES
     ) -> Floats:
-        """Return the derivative of the reaction with respect to additional sources.
+        """Return the derivative (c, n + i, 3) in T of the reaction by additional sources.
 
         For linear iron this is the reaction to the sources.
 
@@ -173,10 +165,6 @@ class IronReaction(WithBar):
             Points in iron, for which the derivative of mu_0 H follows that at the points.
         modes : int
             Highest azimuthal mode.
-
-        Returns
-        -------
-        ndarray, shape (c, n + i, 3), in T
         """
         state, numbers = self.problem, np.arange(modes + 1)
         spaces = [state.modes.exterior(number) for number in numbers.tolist()]
@@ -228,7 +216,6 @@ def solve_iron(
         Its folder receives the mesh and the runs of GetDP.
     name : str
         Name of the study.
-    resolution : Resolution, optional
     estimate : bool
         Whether to solve once more with a coarser resolution, for the error bar.
     start : IronReaction, optional
@@ -428,7 +415,6 @@ def to_angles(by_mode: Complexes, numbers: Ints, angles: int) -> Floats:
     by_mode : ndarray, shape (modes, ...)
     numbers : ndarray of int, shape (modes,)
         The modes m, all below half of ``angles``.
-    angles : int
     """
     spectrum = np.zeros((angles // 2 + 1, *by_mode.shape[1:]), complex)
     spectrum[numbers] = by_mode * (angles / 2)
@@ -478,28 +464,19 @@ def excess_in(bodies: Sequence[IronSolid], body: Ints, square: Floats) -> tuple[
 
 @dataclass(frozen=True)
 class Problem:
-    """The discrete problem.
-
-    Attributes
-    ----------
-    modes : IronModes
-    bodies : tuple of IronSolid
-    numbers : ndarray of int
-        The azimuthal modes, ascending.
-    stiffnesses : tuple of sparse array, shape (iron, iron)
-        By mode: the stiffness of vacuum, condensed to the iron.
-    gradients : tuple of sparse array, shape (3 k, iron)
-        By mode: the operators to d/dr, m/r and d/dz at the k Gauss points of the iron.
-    angles : int
-        Angles at which the law is evaluated.
-    """
+    """The discrete problem."""
 
     modes: IronModes
     bodies: tuple[IronSolid, ...]
     numbers: Ints
+    """The azimuthal modes, ascending."""
     stiffnesses: tuple[sparse.csr_array, ...]
+    """By mode: the stiffness of vacuum, condensed to the iron. Shape (iron, iron)."""
     gradients: tuple[sparse.csr_array, ...]
+    """By mode: the operators to d/dr, m/r and d/dz at the k Gauss points of the iron.
+    Shape (3 k, iron)."""
     angles: int
+    """Angles at which the law is evaluated."""
 
     def field(self, potential: Complexes, angles: int | None = None) -> Floats:
         """Return grad psi (angles, 3, k, c) in cylindrical components at the Gauss points."""
@@ -550,20 +527,13 @@ class Problem:
 
 @dataclass(frozen=True)
 class Tangent:
-    """The derivative of the residual at a state, and its preconditioner.
-
-    Attributes
-    ----------
-    problem : Problem
-    differential : ndarray, shape (angles, 3, 3, k)
-        d mu_0 M / d mu_0 H.
-    factors : tuple of SuperLU
-        By mode: the derivative with the mean of ``differential`` over the angle.
-    """
+    """The derivative of the residual at a state, and its preconditioner."""
 
     problem: Problem
     differential: Floats
+    """d mu_0 M / d mu_0 H. Shape (angles, 3, 3, k)."""
     factors: tuple[sparse_linalg.SuperLU, ...]
+    """By mode: the derivative with the mean of ``differential`` over the angle."""
 
     @classmethod
     def of(cls, problem: Problem, differential: Floats) -> Tangent:

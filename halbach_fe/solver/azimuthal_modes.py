@@ -32,7 +32,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, slices
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -109,9 +109,14 @@ def few_modes_suffice(magnet: Magnet, points: Floats) -> Bools:
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
-    """Return the highest mode that matters at any of the points (n, 3) in m."""
+    """Return the highest mode that matters at any of the points (n, 3) in m.
+
+    Above 4 it is a multiple of 4, so that points that move a little are served by the same runs.
+    """
     worst = float(np.clip(mode_decay(magnet, points).max(), 1e-9, 1 - 1e-9))
-    return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+    highest = max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+    alike = 4  # modes
+    return highest if highest <= alike else alike * -(-highest // alike)
 
 
 def mode_decay(magnet: Magnet, points: Floats) -> Floats:
@@ -134,52 +139,35 @@ def mode_decay(magnet: Magnet, points: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Ring:
-    """Data of one ring for the template case_modes.pro.j2, which describes them.
-
-    Attributes
-    ----------
-    recoil_permeability : float
-    half_angle : float, in rad
-        Half the angle of a block.
-    rank : int
-        Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings,
-        and in runs for the nominal array.
-    along, across, axial : list of float, in T
-        Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
-        part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for
-        single blocks.
-    """
+    """Data of one ring for the template case_modes.pro.j2, which describes them."""
 
     recoil_permeability: float
     half_angle: float
+    """Half the angle of a block. In rad."""
     rank: int
+    """Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings, and
+    in runs for the nominal array."""
     along: list[float]
     across: list[float]
     axial: list[float]
+    """Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
+    part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for single
+    blocks. In T."""
 
 
 @dataclass(frozen=True)
 class ModesCase:
-    """The data that all runs for a magnet share.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    mesh : VerifiedMesh or CountedMesh
-        Mesh of the (r, z) half-plane.
-    weights : ndarray, shape (modes, 2, rings, 3), in T
-        Remanence of the nominal array, see `nominal_waves`.
-    solved : tuple of int
-        Numbers, from 0, of the rings that hold the blocks to solve for.
-    meridian : ndarray, shape (m, 3), in m
-        Points (r, z, 0) of the half-plane at which fields are evaluated.
-    """
+    """The data that all runs for a magnet share."""
 
     magnet: Magnet
     mesh: VerifiedMesh | CountedMesh
+    """Mesh of the (r, z) half-plane."""
     weights: Floats
+    """Remanence of the nominal array, see `nominal_waves`. Shape (modes, 2, rings, 3), in T."""
     solved: tuple[int, ...]
+    """Numbers, from 0, of the rings that hold the blocks to solve for."""
     meridian: Floats
+    """Points (r, z, 0) of the half-plane at which fields are evaluated. Shape (m, 3), in m."""
 
     @property
     def real_mesh(self) -> VerifiedMesh:
@@ -237,7 +225,6 @@ def solve_modes(
     blocks : sequence of int
         Numbers, from 0, of the blocks to solve for with a remanence of 1 T along x, y and z. Since
         the blocks of a ring share their solutions, more blocks of the same ring cost nothing more.
-    session : Session
     highest : int, optional
         The highest mode, by default `modes_needed`.
     single_blocks : callable, optional
@@ -310,8 +297,7 @@ def _shared_out(modes: list[int], most: int) -> list[list[int]]:
     Mode 0 has no boundary condition on the axis, unlike all others.
     """
     others, most = [m for m in modes if m > 0], max(1, most)
-    return [others[first:first + most] for first in range(0, len(others), most)
-            ] + [[m] for m in modes if m == 0]
+    return [others[part] for part in slices(len(others), most)] + [[m] for m in modes if m == 0]
 
 
 def nominal_waves(magnet: Magnet, highest: int) -> Floats:
@@ -400,7 +386,6 @@ def fill_run_folder(
 
     Parameters
     ----------
-    case : ModesCase
     folder : Path
         An existing folder.
     modes : list of int
@@ -411,7 +396,6 @@ def fill_run_folder(
         The source whose gradients GetDP prints, in the first mode.
     vacuum : bool
         Whether all materials are replaced by vacuum.
-    time_limit_s : float
     """
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
@@ -442,7 +426,6 @@ def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
         Off the outer boundary.
     axis : Entities
         Of these, those on the axis.
-    mode : int
     """
     everywhere, fixed = (part.nodes + part.edges + part.faces for part in (inner, axis))
     return everywhere - (fixed if mode > 0 else 0)
@@ -505,14 +488,12 @@ def _superpose(
 
     Parameters
     ----------
-    case : ModesCase
     nominal, single : dict of int to ndarray, shape (sources, m, 3), in T
         d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode, of the nominal
         array and of single blocks.
     points : ndarray, shape (n, 3), in m
     where : ndarray of int, shape (n,)
         Number of each point's (r, z) among the points of the half-plane.
-    blocks : sequence of int
 
     Returns
     -------

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, unit_circle
+from halbach_fe.core.arrays import Floats, slices, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.coils import closed_polygon, closest, distance, turn_corners
@@ -204,8 +204,7 @@ def _straight(shares: Floats, corners: Floats, points: Floats) -> Floats:
     starts, along, lengths = (part[lengths > 0] for part in (starts, along, lengths))
     found = np.zeros((len(points), 3))
     at_once = max(1, 100_000 // len(starts))  # so that arrays stay in the cache
-    for first in range(0, len(points), at_once):
-        some = slice(first, first + at_once)
+    for some in slices(len(points), at_once):
         x, y, z = (points[some, None, i] - starts[:, i] for i in range(3))
         u, v, w = along.T
         near = np.sqrt(x**2 + y**2 + z**2)

@@ -31,21 +31,14 @@ CONNECT_S = 20.0
 
 @dataclass(frozen=True)
 class Answer:
-    """The outcome of a run of GetDP on a worker.
-
-    Attributes
-    ----------
-    lines : list of str
-        The log, empty after a failure.
-    files : dict of str to bytes
-        Content of every file that the run wrote, by name; after a failure the log is among them.
-    failure : str
-        Why the result cannot be trusted; empty if the run passed verification.
-    """
+    """The outcome of a run of GetDP on a worker."""
 
     lines: list[str]
+    """The log, empty after a failure."""
     files: dict[str, bytes]
+    """Content of every file that the run wrote, by name; after a failure the log is among them."""
     failure: str = ""
+    """Why the result cannot be trusted; empty if the run passed verification."""
 
 
 class _Workers(Executor):

@@ -28,25 +28,19 @@ _IMAGINARY = "imaginary parts, which a static field has not"
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The unknowns of a system by mesh entity.
-
-    Attributes
-    ----------
-    count : int
-        Number of unknowns.
-    functions : tuple of ndarray of int
-        For each kind of basis function, in the order of the problem file: index of the unknown by
-        entity number, or -1 if the entity has no unknown (its value is fixed, or no entity has this
-        number). Nodes are numbered from 1 in the order of the mesh, edges and faces by GetDP.
-    edges, faces : ndarray of int, shape (elements, k)
-        Numbers of the k edges or faces of every element, in the mesh's order of elements; the sign
-        of an edge gives its direction. Without rows if the problem does not use edges or faces.
-    """
+    """The unknowns of a system by mesh entity."""
 
     count: int
+    """Number of unknowns."""
     functions: tuple[Ints, ...]
+    """For each kind of basis function, in the order of the problem file: index of the unknown by
+    entity number, or -1 if the entity has no unknown (its value is fixed, or no entity has this
+    number). Nodes are numbered from 1 in the order of the mesh, edges and faces by GetDP."""
     edges: Ints
     faces: Ints
+    """Numbers of the k edges or faces of every element, in the mesh's order of elements; the sign
+    of an edge gives its direction. Without rows if the problem does not use edges or faces.
+    Shape (elements, k)."""
 
 
 # Number of edges and of faces of an element, by meshio's name of its type.
@@ -56,11 +50,7 @@ _PARTS = {"triangle6": (3, 1), "quad": (4, 1), "tetra10": (6, 4)}
 def read_unknowns(path: Path, cell_type: str) -> Unknowns:
     """Read the ``.pre`` file of a run on a mesh of one type of elements.
 
-    Parameters
-    ----------
-    path : Path
-    cell_type : str
-        meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
+    ``cell_type``: meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
 
     Raises
     ------
@@ -130,12 +120,8 @@ def _entities(text: str, name: str, count: int) -> Ints:
 def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> NDArray[np.floating]:
     """Return the last ``solves`` solutions in a file of PETSc vectors.
 
-    Parameters
-    ----------
-    path : Path
-    unknowns, solves : int
-    before : int
-        Number of other solutions that come first in the file, such as the steps of Newton's method.
+    ``before``: number of other solutions that come first in the file, such as the steps of Newton's
+    method.
 
     Returns
     -------

@@ -36,7 +36,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, azimuths_of, radii_of
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, slices
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
@@ -94,8 +94,7 @@ def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Float
     """Yield `unit_field` of every block, in order; blocks of one shape are evaluated at once."""
     most = 1 + _AT_ONCE // max(1, len(points))
     basis = matrix_of(np.eye(6))
-    for first in range(0, len(blocks), most):
-        some = blocks[first:first + most]
+    for some in (blocks[part] for part in slices(len(blocks), most)):
         found = np.empty((len(some), len(points), 6))
         for same in _alike(some):
             alike = _Alike.of([some[number] for number in same])
@@ -175,8 +174,7 @@ def _sum_of(groups: Sequence[_Alike], points: Floats) -> Floats:
     """Return `field_of` all blocks of groups."""
     total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
     for group in groups:
-        for first in range(0, len(group.axes), most):
-            part = slice(first, first + most)
+        for part in slices(len(group.axes), most):
             total += (group.fields(points, part) @ group.sums[part]).sum(axis=0)
     return total
 
@@ -210,22 +208,16 @@ def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Blocks of the same shape, and what of their fields does not depend on the points.
-
-    Attributes
-    ----------
-    first : MagnetBlock
-    positions, axes : ndarray, shapes (blocks, 3) in m and (blocks, 3, 3)
-        Of frames, with the axes as columns, in which the outlines of all blocks are that of the
-        first one.
-    sums : ndarray, shape (blocks, 6, 3), in T
-        From the field matrices in such a frame to the field of the nominal remanence.
-    """
+    """Blocks of the same shape, and what of their fields does not depend on the points."""
 
     first: MagnetBlock
     positions: Floats
     axes: Floats
+    """Of frames, with the axes as columns, in which the outlines of all blocks are that of the
+    first one. Shapes (blocks, 3) in m and (blocks, 3, 3)."""
     sums: Floats
+    """From the field matrices in such a frame to the field of the nominal remanence.
+    Shape (blocks, 6, 3), in T."""
 
     @classmethod
     def of(cls, blocks: Sequence[MagnetBlock]) -> _Alike:
@@ -439,19 +431,13 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
 
 
 def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Floats:
-    """Return B of a second magnet with the study's blocks, shifted along z and turned about z.
+    """Return B (n, 3) in T of a second magnet of the study's blocks, shifted along z and turned.
 
     Its permeability is that of vacuum, and its remanence is scaled by ``neighbour.factor``.
 
     Parameters
     ----------
-    magnet : Magnet
-    neighbour : Neighbour
     points : ndarray, shape (n, 3), in m
-
-    Returns
-    -------
-    ndarray, shape (n, 3), in T
     """
     turn = rotation_about_z(np.radians(neighbour.turn_deg))
     local_points = (points - [0.0, 0.0, neighbour.z_m]) @ turn

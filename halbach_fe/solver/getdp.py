@@ -116,70 +116,46 @@ _NAMED_FAILURES = (  # pattern in the log, and its meaning
 
 @dataclass(frozen=True)
 class GetDP:
-    """A GetDP executable and its build, as ``getdp -info`` prints it.
-
-    Attributes
-    ----------
-    executable : Path
-    version : str
-    build_options : tuple of str
-    petsc : str
-        Version of PETSc; empty if it is not printed.
-    """
+    """A GetDP executable and its build, as ``getdp -info`` prints it."""
 
     executable: Path
     version: str
     build_options: tuple[str, ...]
     petsc: str
+    """Version of PETSc; empty if it is not printed."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of GetDP.
-
-    Attributes
-    ----------
-    problem, mesh : str
-        Names of files inside the run folder.
-    resolution : str
-        Name of the Resolution in the problem file.
-    outputs : tuple of str
-        Files that the run must write.
-    numbers : mapping
-        ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
-    solutions, matrix : str or None
-        Files to which PETSc writes the solution of every linear system, and the matrix of the last
-        one; `halbach_fe.solver.dofs` reads them. None if they are not wanted.
-    unknowns : int or None
-        Number of unknowns that the system must have; None if it is not known in advance.
-    solves : int
-        Smallest number of linear solves that the log must show, each with its residuals.
-    options : tuple of str
-        PETSc options of the linear solver.
-    linear_residual : float
-        Largest accepted last residual of a linear solve, relative to its first residual.
-    time_limit_s : float
-        The run is killed after this time.
-    threads : int
-        Threads of the linear algebra.
-    processes : int
-        MPI processes that share the run.
-    """
+    """One run of GetDP."""
 
     problem: str
     mesh: str
+    """Names of files inside the run folder."""
     resolution: str
+    """Name of the Resolution in the problem file."""
     outputs: tuple[str, ...]
+    """Files that the run must write."""
     numbers: Mapping[str, float] = field(default_factory=dict)
+    """``-setnumber`` constants; each must be declared by a DefineConstant of the problem."""
     solutions: str | None = None
     matrix: str | None = None
+    """Files to which PETSc writes the solution of every linear system, and the matrix of the last
+    one; `halbach_fe.solver.dofs` reads them. None if they are not wanted."""
     unknowns: int | None = None
+    """Number of unknowns that the system must have; None if it is not known in advance."""
     solves: int = 1
+    """Smallest number of linear solves that the log must show, each with its residuals."""
     options: tuple[str, ...] = DIRECT_SOLVER
+    """PETSc options of the linear solver."""
     linear_residual: float = MAX_RELATIVE_RESIDUAL
+    """Largest accepted last residual of a linear solve, relative to its first residual."""
     time_limit_s: float = 3600.0
+    """The run is killed after this time."""
     threads: int = 1
+    """Threads of the linear algebra."""
     processes: int = 1
+    """MPI processes that share the run."""
 
     @property
     def large(self) -> tuple[str, ...]:
@@ -231,10 +207,7 @@ def _advice() -> str:
 def find_getdp(named: str | Path | None = None) -> GetDP:
     """Find the GetDP executable and read its version and build from ``getdp -info``.
 
-    Parameters
-    ----------
-    named : str or Path, optional
-        The executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of pyonelab.
+    ``named``: the executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of pyonelab.
 
     Raises
     ------
@@ -293,8 +266,6 @@ def run(
 
     Parameters
     ----------
-    getdp : GetDP
-    job : Job
     folder : Path
         The run folder with all input files. Output files and the log, ``getdp.log``, are written
         there.
@@ -341,7 +312,7 @@ def run(
 
 
 def read_vectors(path: Path, points: Floats) -> Floats:
-    """Read a table of vectors at points that GetDP printed as SimpleTable, and verify it.
+    """Read a table of vectors (n, 3) at points that GetDP printed as SimpleTable, and verify it.
 
     Parameters
     ----------
@@ -349,10 +320,6 @@ def read_vectors(path: Path, points: Floats) -> Floats:
         The file; its columns are x, y, z and three components.
     points : ndarray, shape (n, 3), in m
         The points at which GetDP was asked to print the vectors.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
 
     Raises
     ------

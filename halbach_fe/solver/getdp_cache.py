@@ -71,20 +71,13 @@ class Manifest(BaseModel):
 
 @dataclass(frozen=True)
 class Stored:
-    """An existing entry.
-
-    Attributes
-    ----------
-    folder : Path
-    bytes : int
-        Size of all its files.
-    used : float
-        Time of the last use in s since 1970.
-    """
+    """An existing entry."""
 
     folder: Path
     bytes: int
+    """Size of all its files."""
     used: float
+    """Time of the last use in s since 1970."""
 
     @property
     def manifest(self) -> Manifest | None:
@@ -155,28 +148,18 @@ class Cache:
 
 @dataclass(frozen=True)
 class Entry:
-    """The place in the cache for the result of one run.
-
-    Attributes
-    ----------
-    cache : Cache
-    folder : Path
-        Folder of the entry, which need not exist.
-    run_folder : Path
-        Folder of the run.
-    given : frozenset of str
-        Names of the run's input files.
-    job : Job
-    version : str
-        Version of GetDP.
-    """
+    """The place in the cache for the result of one run."""
 
     cache: Cache
     folder: Path
+    """Folder of the entry, which need not exist."""
     run_folder: Path
+    """Folder of the run."""
     given: frozenset[str]
+    """Names of the run's input files."""
     job: Job
     version: str
+    """Version of GetDP."""
 
     def restore(self, on_line: Callable[[str], None]) -> bool:
         """Copy the stored result into the run folder; return False if there is none.
@@ -262,11 +245,8 @@ class Entry:
 def default_cache(folder: Path | None = None) -> Cache | None:
     """Return the user's cache, or None if the limit in the environment is 0.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Folder of the cache; by default that of $HALBACH_FE_CACHE, else ``halbach-fe`` in
-        $XDG_CACHE_HOME or ``~/.cache``. None is also returned if the user has no home folder.
+    ``folder``: folder of the cache; by default that of $HALBACH_FE_CACHE, else ``halbach-fe`` in
+    $XDG_CACHE_HOME or ``~/.cache``. None is also returned if the user has no home folder.
 
     Raises
     ------

@@ -29,7 +29,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, PointsOutsideError
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns
@@ -61,20 +61,14 @@ class Located:
     A point on a face belongs to both neighbouring elements. Derivatives of a solution jump there,
     and the mean over the elements that hold the point is taken. A point therefore has one or
     several instances (m >= n).
-
-    Attributes
-    ----------
-    cells : ndarray of int, shape (m,)
-        Index of the element that holds an instance, in the mesh's order.
-    reference : ndarray, shape (m, d)
-        Reference coordinates of an instance in its element.
-    mean : sparse array, shape (n, m)
-        Operator from values at the m instances to their means at the n points.
     """
 
     cells: Ints
+    """Index of the element that holds an instance, in the mesh's order. Shape (m,)."""
     reference: Floats
+    """Reference coordinates of an instance in its element. Shape (m, d)."""
     mean: sparse.csr_array
+    """Operator from values at the m instances to their means at the n points. Shape (n, m)."""
 
 
 def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Located:
@@ -82,7 +76,6 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
 
     Parameters
     ----------
-    mesh : VerifiedMesh
     points : ndarray, shape (n, 3), in m
         On a 2D mesh the third coordinate is ignored.
     anywhere : bool
@@ -174,11 +167,7 @@ def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
     Methods Appl. Mech. Engrg. 55 (1986) 339. The same points as in GetDP give the same discrete
     problem.
 
-    Parameters
-    ----------
-    mesh : VerifiedMesh
-    cells : ndarray of int
-        Indices of the elements.
+    ``cells``: indices of the elements.
 
     Returns
     -------
@@ -418,8 +407,7 @@ def apply_operator(operator: sparse.csr_array, solutions: NDArray[np.floating]) 
     """Apply an operator (n, unknowns) to solutions (k, unknowns); the result has shape (k, n)."""
     result = np.empty((len(solutions), operator.shape[0]))
     step = 32  # number of solutions that are read from the disk at a time, which limits the memory
-    for first in range(0, len(solutions), step):
-        part = slice(first, first + step)
+    for part in slices(len(solutions), step):
         result[part] = (operator @ solutions[part].astype(float).T).T
     return result
 
@@ -477,7 +465,6 @@ def grid_operators(
         A grid of rectangles of the (r, z) half-plane.
     located : Located
         n points in air.
-    unknowns : Unknowns
 
     Returns
     -------

@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -31,7 +31,7 @@ import scipy.sparse.linalg as sparse_linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import PointsOutsideError, StudyError, must_be
 from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
@@ -58,9 +58,6 @@ from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import RunSize, Session
 
-if TYPE_CHECKING:
-    from halbach_fe.geo.iron_bodies import Sizes
-
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
 
@@ -77,41 +74,134 @@ Without preconditioning it is 20 to 60 times as large as what GetDP stops at: 6e
 numbering of the unknowns makes 0.5 or more."""
 
 
+_FACES = np.array([(1, 2, 3, 5, 9, 8), (0, 2, 3, 6, 9, 7), (0, 1, 3, 4, 8, 7), (0, 1, 2, 4, 5, 6)])
+"""Nodes of the faces of a tetrahedron, of which each is opposite the corner of its number."""
+
+
 @dataclass(frozen=True)
-class Problem:
-    """The discrete problem of the iron.
+class Surface:
+    """The curved faces of the elements that bound the iron of a mesh.
 
     Attributes
     ----------
-    bodies : tuple of IronSolid
-    stiffness_of_vacuum : sparse array, shape (n, n)
-    nodes : ndarray of int, shape (e, 10)
-        Unknowns of the iron's elements.
-    slopes : ndarray, shape (e, 15, 10, 3), in 1/m
-        Gradients of the functions of the nodes at the Gauss points.
-    weights : ndarray, shape (e, 15), in m^3
-    places : ndarray, shape (e, 10, 3), in m
-        Places of the nodes.
-    body : ndarray of int, shape (e,)
-        Body of each element.
-    coarse : sparse array, shape (n, corners)
-        Values at all nodes of those at the corners, linear in between.
+    places : ndarray, shape (f, 6, 3), in m
+        Nodes of each face.
+    within : ndarray, shape (f, 3), in m
+        The corner of its element that is not on the face.
+    reach : ndarray, shape (f,), in m
+        Distance of the farthest node of the element from its middle.
     """
+
+    places: Floats
+    within: Floats
+    reach: Floats
+
+    @cached_property
+    def _middles(self) -> KDTree:
+        return KDTree(self.places[:, :3].mean(axis=1))
+
+    def beside(self, points: Floats) -> Floats:
+        """Return points (n, 3) in m, those that are too near moved off to where the field is exact.
+
+        Points on a face of iron are too near, and those beside a round one may lie in the mesh.
+        """
+        from halbach_fe.solver.tetrahedra import RESOLVED  # imports numba
+
+        found = np.array(points)
+        for _ in range(3):  # where two faces meet at an inner corner, each in turn
+            foot, normal, face = self._nearest(found)
+            near = np.flatnonzero(face >= 0)
+            apart = found[near] - foot[near]
+            distance, size = np.linalg.norm(apart, axis=1), RESOLVED * self.reach[face[near]]
+            height = np.einsum("ni,ni->n", apart, normal[near])
+            outside = (height > 0) & (distance > 1e-3 * size)
+            moved = (distance < 0.999 * size) | (height < 0)
+            out = np.where(outside[:, None], apart / np.maximum(distance, 1e-300)[:, None],
+                           normal[near])
+            found[near[moved]] = (foot[near] + size[:, None] * out)[moved]
+            if not moved.any():
+                break
+        return found
+
+    def _nearest(self, points: Floats) -> tuple[Floats, Floats, Ints]:
+        """Return the nearest places (n, 3) in m on the surface, normals there, and faces (n,).
+
+        The face is -1 for points farther away than a tenth of the element's size.
+        """
+        foot, normal = np.zeros_like(points), np.zeros_like(points)
+        face, best = np.full(len(points), -1), np.full(len(points), np.inf)
+        many, most = min(12, len(self.places)), 1.1 * self.reach.max()
+        near = np.flatnonzero(self._middles.query(points, distance_upper_bound=most)[0] < np.inf)
+        if not len(near):
+            return foot, normal, face
+        for tried in self._middles.query(points[near], many)[1].reshape(len(near), many).T:
+            place, across = self._project(tried, points[near])
+            distance = np.linalg.norm(points[near] - place, axis=1)
+            closer = (distance < best[near]) & (distance < 0.1 * self.reach[tried])
+            rows = near[closer]
+            foot[rows], normal[rows] = place[closer], across[closer]
+            face[rows], best[rows] = tried[closer], distance[closer]
+        return foot, normal, face
+
+    def _project(self, faces: Ints, points: Floats) -> tuple[Floats, Floats]:
+        """Return places (n, 3) in m on faces (n,) next to points (n, 3), and normals outwards."""
+        nodes, reference = self.places[faces], np.full((len(points), 2), 1 / 3)
+        for _ in range(6):  # most faces are flat, so that the first step is exact for them
+            values, slopes = shape_functions("triangle6", reference)
+            along = np.einsum("nkd,nke->nde", nodes, slopes)
+            apart = points - np.einsum("nk,nkd->nd", values, nodes)
+            step = np.einsum("nij,nj->ni", np.linalg.pinv(along), apart)
+            reference = np.clip(reference + step, 0.0, 1.0)
+            reference /= np.maximum(reference.sum(axis=1, keepdims=True), 1.0)
+        values, slopes = shape_functions("triangle6", reference)
+        place = np.einsum("nk,nkd->nd", values, nodes)
+        along = np.einsum("nkd,nke->nde", nodes, slopes)
+        normal = np.cross(along[..., 0], along[..., 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        inwards = np.einsum("ni,ni->n", normal, self.within[faces] - place) > 0
+        return place, np.where(inwards[:, None], -normal, normal)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The discrete problem of the iron."""
 
     bodies: tuple[IronSolid, ...]
     stiffness_of_vacuum: sparse.csr_array
+    """Shape (n, n)."""
     nodes: Ints
+    """Unknowns of the iron's elements. Shape (e, 10)."""
     slopes: Floats
+    """Gradients of the functions of the nodes at the Gauss points. Shape (e, 15, 10, 3), in 1/m."""
     weights: Floats
+    """Shape (e, 15), in m^3."""
     places: Floats
+    """Places of the nodes. Shape (e, 10, 3), in m."""
     body: Ints
+    """Body of each element. Shape (e,)."""
     coarse: sparse.csr_array
+    """Values at all nodes of those at the corners, linear in between. Shape (n, corners)."""
 
     @cached_property
     def points(self) -> Floats:
         """The Gauss points (15 e, 3) in m."""
         values, _ = shape_functions("tetra10", _reference())
         return np.einsum("qa,eai->eqi", values, self.places).reshape(-1, 3)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The faces that belong to one element."""
+        corners = np.sort(self.nodes[:, _FACES[:, :3]], axis=2).reshape(-1, 3)
+        _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
+        element, opposite = np.divmod(first[count == 1], 4)
+        return Surface(self.places[element[:, None], _FACES[opposite]],
+                       self.places[element, opposite], self.middle_and_reach[1][element])
+
+    @cached_property
+    def middle_and_reach(self) -> tuple[Floats, Floats]:
+        """Middle (e, 3) of each element, and distance (e,) of its farthest node from it, in m."""
+        middle = self.places[:, :4].mean(axis=1)
+        return middle, np.linalg.norm(self.places - middle[:, None], axis=2).max(axis=1)
 
     def field(self, potential: Floats) -> Floats:
         """Return grad psi (e, 15, 3, c) of potentials (n, c)."""
@@ -184,8 +274,7 @@ class Problem:
         size = self.stiffness_of_vacuum.shape[0]
         parts = np.empty((len(self.nodes), 10, 10))
         step = 4096  # elements at a time, which limits the memory
-        for first in range(0, len(parts), step):
-            some = slice(first, first + step)
+        for some in slices(len(parts), step):
             weighted = differential[some] * self.weights[some, :, None, None]
             parts[some] = np.einsum("eqai,eqij,eqbj->eab", self.slopes[some], weighted,
                                     self.slopes[some], optimize=True)
@@ -256,26 +345,17 @@ class Tangent:
 
 @dataclass(frozen=True)
 class BodiesReaction(WithBar):
-    """The field that iron adds to that of its sources; `solve_bodies` returns it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the study.
-    problem : Problem
-    total : ndarray, shape (n, 1), in T m
-        The total potential in the iron.
-    residuals : tuple of float
-        Relative residual of Newton's method at the start and after every step.
-    coarse : BodiesReaction or None
-        The solution with larger elements, for the error bar.
-    """
+    """The field that iron adds to that of its sources; `solve_bodies` returns it."""
 
     name: str
+    """Name of the study."""
     problem: Problem
     total: Floats
+    """The total potential in the iron. Shape (n, 1), in T m."""
     residuals: tuple[float, ...]
+    """Relative residual of Newton's method at the start and after every step."""
     coarse: BodiesReaction | None
+    """The solution with larger elements, for the error bar."""
 
     @cached_property
     def polarization(self) -> Floats:
@@ -356,7 +436,10 @@ def _reference() -> Floats:
 
 
 def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
-    """Return B (n, 3) in T at points (n, 3) in m outside of a polarization (e, 15, 3) in T."""
+    """Return B (n, 3) in T at points (n, 3) in m outside of a polarization (e, 15, 3) in T.
+
+    On the surface it is that just outside, see `Surface.beside`.
+    """
     from halbach_fe.solver.tetrahedra import add_field
 
     reference, weights = QUADRATURE["tetra10"]
@@ -364,10 +447,9 @@ def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
     # the polarization in an element as a polynomial of second degree
     by_node = np.einsum("aq,eqi->eai", np.linalg.pinv(values), polarization)
     dipoles = polarization * problem.weights[..., None]
-    middle = problem.places[:, :4].mean(axis=1)
-    reach = np.linalg.norm(problem.places - middle[:, None], axis=2).max(axis=1)
+    middle, reach = problem.middle_and_reach
     found = np.zeros((len(points), 3))
-    points = np.ascontiguousarray(points)
+    points = problem.surface.beside(points)
     gauss = problem.points.reshape(-1, POINTS, 3)
 
     def work(first: int, last: int) -> None:
@@ -398,10 +480,8 @@ def solve_bodies(
 
     Parameters
     ----------
-    magnet : Magnet
     source : callable
         mu_0 H of the sources in T at points (n, 3) in m in the iron.
-    session : Session
     estimate : bool
         Whether to solve once more with larger elements, for the error bar.
     start : BodiesReaction, optional
@@ -434,35 +514,41 @@ def solve_bodies(
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 
+Found = TypeVar("Found", covariant=True)
+
+
 @dataclass(frozen=True)
-class _Asked:
-    """A problem to assemble: what it depends on, and how to do it."""
+class Asked(Generic[Found]):
+    """What is to be computed once: what it depends on, and how to do it."""
 
     key: tuple[object, ...]
-    assemble: Callable[[], Problem] = field(compare=False)
+    compute: Callable[[], Found] = field(compare=False)
 
 
 @lru_cache(maxsize=2)  # that of the field and a coarser one; blocks that are updated change neither
-def _assembled(asked: _Asked) -> Problem:
-    return asked.assemble()
+def _assembled(asked: Asked[Problem]) -> Problem:
+    return asked.compute()
+
+
+def key_of(magnet: Magnet, session: Session, coarseness: float) -> tuple[object, ...]:
+    """Return what the problem of a magnet's iron depends on."""
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+
+    sizes = Sizes.of(magnet.study.mesh, coarseness)
+    return magnet.study.iron, magnet.array_half_length, sizes, session.getdp
 
 
 def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Problem:
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
-    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
-
-    sizes = Sizes.of(magnet.study.mesh, coarseness)
-    key = magnet.study.iron, magnet.array_half_length, sizes, session.getdp
-    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes, coarseness)))
+    return _assembled(Asked(key_of(magnet, session, coarseness),
+                            partial(_assemble, magnet, session, coarseness)))
 
 
-def _assemble(
-    magnet: Magnet, session: Session, sizes: Sizes, coarseness: float
-) -> Problem:
-    """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
-    from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
+def _assemble(magnet: Magnet, session: Session, coarseness: float) -> Problem:
+    """Assemble the problem, as `assemble_bodies` does."""
+    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
 
-    shells = []
+    shells, sizes = [], Sizes.of(magnet.study.mesh, coarseness)
 
     def draw(path: Path) -> tags.Regions:
         regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, path)
@@ -523,10 +609,6 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     """Refuse iron whose mesh would not fit into memory, with a size of elements that would.
 
     ``known`` is the number of unknowns once it is meshed. Before, the estimate may be a third low.
-
-    Raises
-    ------
-    StudyError
     """
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 

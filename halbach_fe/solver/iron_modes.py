@@ -49,27 +49,18 @@ ONE_LINE_M = 1e-9
 
 @dataclass(frozen=True)
 class Resolution:
-    """How finely the iron and its neighbourhood are resolved.
-
-    Attributes
-    ----------
-    edge : float
-        Size of the elements at the edges of iron, relative to the thickness of the thinnest iron.
-    growth : float
-        Ratio of the sizes of neighbouring elements.
-    largest : float
-        Largest size of elements near the iron, relative to its outer radius.
-    modes : int, optional
-        Highest azimuthal mode; by default as many as the source needs, see `SOURCE_MODES`.
-    boundary : float
-        Distance of the outer boundary, relative to the largest extent of the iron.
-    """
+    """How finely the iron and its neighbourhood are resolved."""
 
     edge: float = 0.35
+    """Size of the elements at the edges of iron, relative to the thickness of the thinnest iron."""
     growth: float = 1.7
+    """Ratio of the sizes of neighbouring elements."""
     largest: float = 0.08
+    """Largest size of elements near the iron, relative to its outer radius."""
     modes: int | None = None
+    """Highest azimuthal mode; by default as many as the source needs, see `SOURCE_MODES`."""
     boundary: float = 20.0
+    """Distance of the outer boundary, relative to the largest extent of the iron."""
 
     def coarser(self, modes: int) -> Resolution:
         """Return a resolution with about twice the error, where ``modes`` are used here."""
@@ -181,23 +172,18 @@ MESH = "iron.msh"
 
 @dataclass(frozen=True)
 class GaussPoints:
-    """Points of the half-plane, with operators from the unknowns to the gradient there.
-
-    Attributes
-    ----------
-    r, z : ndarray, shape (k,), in m
-    weights : ndarray, shape (k,), in m^3
-        Weights of integrals over r dr dz.
-    value, along_r, along_z : sparse array, shape (k, unknowns)
-        psi_m and its derivatives; divide ``value`` by r for the azimuthal one.
-    """
+    """Points of the half-plane, with operators from the unknowns to the gradient there."""
 
     r: Floats
     z: Floats
+    """Shape (k,), in m."""
     weights: Floats
+    """Weights of integrals over r dr dz. Shape (k,), in m^3."""
     value: sparse.csr_array
     along_r: sparse.csr_array
     along_z: sparse.csr_array
+    """psi_m and its derivatives; divide ``value`` by r for the azimuthal one.
+    Shape (k, unknowns)."""
 
     def restricted(self, unknowns: Ints) -> GaussPoints:
         """Return the same points, with operators on some of the unknowns."""
@@ -227,32 +213,21 @@ class GaussPoints:
 
 @dataclass(frozen=True)
 class IronModes:
-    """The finite elements of iron in vacuum, for all azimuthal modes.
-
-    Attributes
-    ----------
-    mesh : VerifiedMesh
-    unknowns : Unknowns
-    plain, azimuthal : sparse array, shape (unknowns, unknowns)
-        K and L: the stiffness of mode m is K + m^2 L.
-    on_axis : ndarray of int
-        Unknowns that vanish for m > 0.
-    iron : ndarray of int
-        The unknowns of the iron.
-    gauss : GaussPoints
-        Gauss points of the iron's elements, on its unknowns.
-    body : ndarray of int, shape (k,)
-        Body that each of these points is in.
-    """
+    """The finite elements of iron in vacuum, for all azimuthal modes."""
 
     mesh: VerifiedMesh
     unknowns: Unknowns
     plain: sparse.csr_array
     azimuthal: sparse.csr_array
+    """K and L: the stiffness of mode m is K + m^2 L. Shape (unknowns, unknowns)."""
     on_axis: Ints
+    """Unknowns that vanish for m > 0."""
     iron: Ints
+    """The unknowns of the iron."""
     gauss: GaussPoints
+    """Gauss points of the iron's elements, on its unknowns."""
     body: Ints
+    """Body that each of these points is in. Shape (k,)."""
     _exteriors: dict[int, Exterior] = field(default_factory=dict, repr=False, compare=False)
 
     def matrix(self, mode: int) -> sparse.csr_array:
@@ -300,27 +275,19 @@ class IronModes:
 
 @dataclass(frozen=True)
 class Exterior:
-    """The space outside the iron in one mode, condensed to the iron's surface.
-
-    Attributes
-    ----------
-    stiffness : sparse array, shape (iron, iron)
-        Stiffness in vacuum, with all other unknowns eliminated.
-    rest : ndarray of int
-        The unknowns outside the iron, in the order of the factorization.
-    surface : ndarray of int
-        Indices into the iron's unknowns of those on its surface.
-    schur : ndarray, shape (surface, surface)
-        Stiffness of the space outside and of the iron's own vacuum, on the surface.
-    factor : SuperLU
-        Factorized stiffness of ``rest``, followed by the surface.
-    """
+    """The space outside the iron in one mode, condensed to the iron's surface."""
 
     stiffness: sparse.csr_array
+    """Stiffness in vacuum, with all other unknowns eliminated. Shape (iron, iron)."""
     rest: Ints
+    """The unknowns outside the iron, in the order of the factorization."""
     surface: Ints
+    """Indices into the iron's unknowns of those on its surface."""
     schur: Floats
+    """Stiffness of the space outside and of the iron's own vacuum, on the surface.
+    Shape (surface, surface)."""
     factor: sparse_linalg.SuperLU
+    """Factorized stiffness of ``rest``, followed by the surface."""
 
     @property
     def bytes(self) -> int:
@@ -367,13 +334,7 @@ def assemble_modes(
 ) -> IronModes:
     """Have GetDP assemble the stiffness of the half-plane around iron, and verify it.
 
-    Parameters
-    ----------
-    name : str
-        Name of the study.
-    bodies : sequence of IronSolid
-    resolution : Resolution
-    session : Session
+    ``name``: name of the study.
 
     Raises
     ------

@@ -81,38 +81,26 @@ from halbach_fe.study.materials import MU_0
 
 @dataclass(frozen=True)
 class Formulation:
-    """A weak form as a GetDP problem, with its unknowns and its linear solvers.
-
-    Attributes
-    ----------
-    problem : str
-        Name of the problem file in pro/.
-    unknowns : callable
-        Returns the number of unknowns, from the numbers of mesh entities off the outer boundary.
-    flux_density : callable
-        Takes a mesh, located points (n,) and unknowns. Returns three sparse operators (n, unknowns)
-        from a solution to Bx, By and Bz in T.
-    factorized : float
-        Largest number of unknowns for which the matrix is factorized. Larger systems are solved by
-        conjugate gradients.
-    factorized_for_newton : float
-        The same limit for Newton's method, where every step has a matrix of its own.
-    numbers : mapping
-        Constants of the problem, for ``-setnumber``.
-    law : str
-        Law of the iron's curve that enters the weak form: ``reluctivity`` or ``permeability``.
-    route : str
-        Name of the route, see `halbach_fe.solver.routes.choose_route`.
-    """
+    """A weak form as a GetDP problem, with its unknowns and its linear solvers."""
 
     problem: str
+    """Name of the problem file in pro/."""
     unknowns: Callable[[Entities], int]
+    """Returns the number of unknowns, from the numbers of mesh entities off the outer boundary."""
     flux_density: Callable[[VerifiedMesh, Located, Unknowns], list[sparse.csr_array]]
+    """Takes a mesh, located points (n,) and unknowns. Returns three sparse operators (n, unknowns)
+    from a solution to Bx, By and Bz in T."""
     factorized: float = np.inf
+    """Largest number of unknowns for which the matrix is factorized. Larger systems are solved by
+    conjugate gradients."""
     factorized_for_newton: float = np.inf
+    """The same limit for Newton's method, where every step has a matrix of its own."""
     numbers: Mapping[str, float] = field(default_factory=dict)
+    """Constants of the problem, for ``-setnumber``."""
     law: str = "reluctivity"
+    """Law of the iron's curve that enters the weak form: ``reluctivity`` or ``permeability``."""
     route: str = "edge_elements"
+    """Name of the route, see `halbach_fe.solver.routes.choose_route`."""
 
 
 def _curl_of_axial(
@@ -179,13 +167,10 @@ def solve_sources(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
         Numbers, from 0, of the blocks to solve for with a remanence of 1 T along each of the D
         axes, while all other blocks have none.
-    session : Session
-    formulation : Formulation
     anywhere : bool
         Whether points may lie in magnet and iron.
 
@@ -210,12 +195,9 @@ def solve_tangent(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
         Numbers, from 0, of the blocks whose derivatives are wanted.
-    session : Session
-    formulation : Formulation
     anywhere : bool
         Whether points may lie in magnet and iron.
 
@@ -245,26 +227,19 @@ def solve_samples(
     magnet: Magnet, points: Floats, samples: Floats, session: Session, formulation: Formulation,
     cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
 ) -> Floats:
-    """Return the finite-element part of B for samples of magnetization, by Newton's method.
+    """Return the finite-element part (k, n, 3) in T of B by Newton's method for magnetizations.
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         In air.
     samples : ndarray, shape (k, blocks, 3), in A/m
         Magnetizations of all blocks.
-    session : Session
-    formulation : Formulation
     cold : bool
         Whether Newton's method starts from zero for every sample, instead of from the solution of
         the sample before.
     tolerance : float
         Largest residual of a solution, relative to the right-hand side.
-
-    Returns
-    -------
-    ndarray, shape (k, n, 3), in T
 
     Raises
     ------
@@ -283,22 +258,15 @@ def nominal_samples(magnet: Magnet) -> Floats:
 
 @dataclass(frozen=True)
 class Assembly:
-    """The linear system of a problem as GetDP assembled it, and its solutions.
-
-    Attributes
-    ----------
-    mesh : VerifiedMesh
-    unknowns : Unknowns
-    matrix : sparse array, shape (unknowns, unknowns)
-        The stiffness, without the fixed degrees of freedom.
-    solutions : ndarray, shape (1 + D blocks, unknowns)
-        The nominal array, then all blocks per tesla of remanence along each axis.
-    """
+    """The linear system of a problem as GetDP assembled it, and its solutions."""
 
     mesh: VerifiedMesh
     unknowns: Unknowns
     matrix: sparse.csr_array
+    """The stiffness, without the fixed degrees of freedom. Shape (unknowns, unknowns)."""
     solutions: Floats
+    """The nominal array, then all blocks per tesla of remanence along each axis.
+    Shape (1 + D blocks, unknowns)."""
 
 
 def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Assembly:
@@ -324,27 +292,17 @@ def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Asse
 
 @dataclass(frozen=True)
 class _Case:
-    """The data that all runs for a magnet on one mesh share.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    mesh : VerifiedMesh or CountedMesh
-    points : ndarray, shape (n, 3), in m
-    blocks : sequence of int
-        Numbers, from 0, of the blocks that are sources of their own.
-    formulation : Formulation
-    anywhere : bool
-        Whether points may lie in magnet and iron.
-    time_limit_s : float
-    """
+    """The data that all runs for a magnet on one mesh share."""
 
     magnet: Magnet
     mesh: VerifiedMesh | CountedMesh
     points: Floats
+    """Shape (n, 3), in m."""
     blocks: Sequence[int]
+    """Numbers, from 0, of the blocks that are sources of their own."""
     formulation: Formulation
     anywhere: bool
+    """Whether points may lie in magnet and iron."""
     time_limit_s: float
 
     @property
@@ -544,26 +502,18 @@ def _fields(
 
 @dataclass(frozen=True)
 class RunRequest:
-    """The sources and materials that one run of GetDP solves for.
-
-    Attributes
-    ----------
-    blocks : sequence of int
-        Numbers, from 0, of the blocks that are sources of their own.
-    sources : tuple of int
-        First and last source, both included. Source 0 is the whole array; the axes of the first of
-        ``blocks`` follow, then those of the next.
-    vacuum : bool
-        Whether all materials are replaced by vacuum.
-    samples : ndarray, shape (k, blocks, 3), in A/m, or None
-        Magnetizations of the whole array; by default the nominal one.
-    time_limit_s : float
-    """
+    """The sources and materials that one run of GetDP solves for."""
 
     blocks: Sequence[int] = ()
+    """Numbers, from 0, of the blocks that are sources of their own."""
     sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE)
+    """First and last source, both included. Source 0 is the whole array; the axes of the first of
+    ``blocks`` follow, then those of the next."""
     vacuum: bool = False
+    """Whether all materials are replaced by vacuum."""
     samples: Floats | None = None
+    """Magnetizations of the whole array; by default the nominal one.
+    Shape (k, blocks, 3), in A/m."""
     time_limit_s: float = 3600.0
 
 
@@ -575,13 +525,10 @@ def fill_run_folder(
 
     Parameters
     ----------
-    magnet : Magnet
-    mesh : VerifiedMesh
     places : ndarray, shape (n, 3), in m
         Points at which GetDP prints the field of the first source.
     folder : Path
         An existing folder.
-    formulation : Formulation
     request : RunRequest, optional
         By default the nominal array is solved for, with real materials.
     """

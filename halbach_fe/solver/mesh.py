@@ -44,19 +44,12 @@ _FACES = {"line": (), "line3": (), "triangle6": ((0, 1, 2),), "quad": ((0, 1, 2,
 
 @dataclass(frozen=True)
 class Entities:
-    """Numbers of entities of a mesh, or of a part of it.
-
-    Attributes
-    ----------
-    nodes : int
-        All nodes, including those in the middle of edges.
-    corners : int
-        Nodes that are corners of elements.
-    edges, faces : int
-    """
+    """Numbers of entities of a mesh, or of a part of it."""
 
     nodes: int
+    """All nodes, including those in the middle of edges."""
     corners: int
+    """Nodes that are corners of elements."""
     edges: int
     faces: int
 
@@ -71,42 +64,30 @@ class MeshFiles:
 
 @dataclass(frozen=True)
 class VerifiedMesh:
-    """A mesh that was checked to hold every region and its outer boundary.
-
-    Attributes
-    ----------
-    path : Path
-    regions : Regions
-        Tags and names of the regions.
-    points : ndarray, shape (nodes, d), in m
-        Coordinates of the nodes; in a half-plane x is r and y is z.
-    cells : ndarray of int, shape (elements, k)
-        Nodes of every element, in the order of the file. All elements are of one type.
-    cell_type : str
-        meshio's name of this type: ``triangle6``, ``quad`` or ``tetra10``.
-    in_air, in_iron : ndarray of bool, shape (elements,)
-    tags : ndarray of int, shape (elements,)
-        Region of every element.
-    inner : Entities
-        Numbers of entities off the outer boundary, from which the number of unknowns follows.
-    axis : Entities
-        Of these, the numbers on the axis of a half-plane; 0 for other meshes.
-    radius, half_length : float
-        Extent of the mesh in m; the half length of a cross-section is infinite.
-    """
+    """A mesh that was checked to hold every region and its outer boundary."""
 
     path: Path
     regions: Regions
+    """Tags and names of the regions."""
     points: Floats
+    """Coordinates of the nodes; in a half-plane x is r and y is z. Shape (nodes, d), in m."""
     cells: Ints
+    """Nodes of every element, in the order of the file. All elements are of one type.
+    Shape (elements, k)."""
     cell_type: str
+    """meshio's name of this type: ``triangle6``, ``quad`` or ``tetra10``."""
     in_air: Bools
     in_iron: Bools
+    """Shape (elements,)."""
     tags: Ints
+    """Region of every element. Shape (elements,)."""
     inner: Entities
+    """Numbers of entities off the outer boundary, from which the number of unknowns follows."""
     axis: Entities
+    """Of these, the numbers on the axis of a half-plane; 0 for other meshes."""
     radius: float
     half_length: float
+    """Extent of the mesh in m; the half length of a cross-section is infinite."""
 
     @property
     def elements(self) -> int:
@@ -116,24 +97,16 @@ class VerifiedMesh:
 
 @dataclass(frozen=True)
 class CountedMesh:
-    """Expected numbers of entities of a mesh that has not been built.
-
-    Attributes
-    ----------
-    elements : int
-    inner : Entities
-        Off the outer boundary.
-    axis : Entities
-        Of these, the numbers on the axis of a half-plane; 0 for other meshes.
-    radius, half_length : float
-        Extent of the mesh in m; the half length of a cross-section is infinite.
-    """
+    """Expected numbers of entities of a mesh that has not been built."""
 
     elements: int
     inner: Entities
+    """Off the outer boundary."""
     axis: Entities
+    """Of these, the numbers on the axis of a half-plane; 0 for other meshes."""
     radius: float
     half_length: float
+    """Extent of the mesh in m; the half length of a cross-section is infinite."""
 
 
 def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:

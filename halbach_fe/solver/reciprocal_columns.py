@@ -74,27 +74,22 @@ def saves_solves(magnet: Magnet, points: Floats, blocks: Sequence[int]) -> bool:
 
 @dataclass(frozen=True)
 class _Discrete:
-    """The discrete problem in the half-plane, for all modes.
-
-    Attributes
-    ----------
-    stiffness : tuple of sparse array, shape (unknowns, unknowns)
-        K and L: the matrix of mode m is w (K + m^2 L), with w = 2 pi for m = 0 and pi otherwise.
-    free : tuple of ndarray of int
-        The unknowns to solve for, in an order that keeps the factors sparse: of mode 0, and of all
-        higher modes, which vanish on the axis.
-    sources : tuple of sparse array, shape (unknowns, solved rings)
-        Integrals over r dr dz, in each ring, of dv/dr, v/r and dv/dz.
-    readings : sparse array, shape (3 m, unknowns)
-        Operators to d psi/dr, psi/r and d psi/dz at the m points, one after the other.
-    half_angle : ndarray, shape (solved rings,), in rad
-    """
+    """The discrete problem in the half-plane, for all modes."""
 
     stiffness: tuple[sparse.csr_array, sparse.csr_array]
+    """K and L: the matrix of mode m is w (K + m^2 L), with w = 2 pi for m = 0 and pi otherwise.
+    Shape (unknowns, unknowns)."""
     free: tuple[Ints, Ints]
+    """The unknowns to solve for, in an order that keeps the factors sparse: of mode 0, and of all
+    higher modes, which vanish on the axis."""
     sources: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array]
+    """Integrals over r dr dz, in each ring, of dv/dr, v/r and dv/dz.
+    Shape (unknowns, solved rings)."""
     readings: sparse.csr_array
+    """Operators to d psi/dr, psi/r and d psi/dz at the m points, one after the other.
+    Shape (3 m, unknowns)."""
     half_angle: Floats
+    """Shape (solved rings,), in rad."""
 
     def gradients(self, mode: int) -> Floats:
         """Return d psi/dr, psi/r and d psi/dz (3 solved rings, points, 3) in T of single blocks.

@@ -21,19 +21,13 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class SectorMagnetization:
-    """A uniformly magnetized sector.
-
-    Attributes
-    ----------
-    middle, half_width : float
-        Azimuth of the sector's middle, and half of its opening angle, in rad.
-    remanence : complex
-        ``B_rx + i B_ry`` in T.
-    """
+    """A uniformly magnetized sector."""
 
     middle: float
     half_width: float
+    """Azimuth of the sector's middle, and half of its opening angle, in rad."""
     remanence: complex
+    """``B_rx + i B_ry`` in T."""
 
 
 def ideal_sectors(
@@ -66,7 +60,7 @@ def bore_field(
     sectors: list[SectorMagnetization], inner_radius: float, outer_radius: float, points: Floats,
     terms: int = 400,
 ) -> Floats:
-    """Return B in the bore of an array of sectors of recoil permeability 1.
+    """Return B (n, 2) in T in the bore of an array of sectors of recoil permeability 1.
 
     A line dipole of remanence j times area dA at z' has ``B_x - i B_y = j dA / (2 pi (z - z')^2)``.
     Integrating its expansion in powers of z/z' over each sector gives the multipoles in closed
@@ -74,17 +68,12 @@ def bore_field(
 
     Parameters
     ----------
-    sectors : list of SectorMagnetization
     inner_radius, outer_radius : float
         Radii of the sectors in m.
     points : ndarray, shape (n, 2), in m
         Inside the inner radius.
     terms : int
         Number of multipoles; the truncation error falls as (r / inner_radius)^terms.
-
-    Returns
-    -------
-    ndarray, shape (n, 2), in T
     """
     k = np.arange(1, terms + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -106,7 +95,7 @@ def layered_bore_field(
     recoil_permeability: float,
     points: Floats, iron: tuple[float, float, float] | None = None, terms: int = 200,
 ) -> Floats:
-    """Return B in the bore of a closed ring of sectors of any permeability, with an iron tube.
+    """Return B (n, 2) in T in a closed ring of sectors of any permeability, with an iron tube.
 
     The scalar potential psi (B = -mu_r grad psi + B_r) is solved for harmonic by harmonic. In every
     layer (bore, magnet, air, iron, outside) harmonic k is ``a r^k + b r^-k``, plus in the magnet a
@@ -127,10 +116,6 @@ def layered_bore_field(
         A tube around the magnets, with an air gap if its inner radius exceeds ``outer_radius``.
     terms : int
         Number of harmonics.
-
-    Returns
-    -------
-    ndarray, shape (n, 2), in T
     """
     radii = [inner_radius, outer_radius]
     permeability = [1.0, recoil_permeability, 1.0]

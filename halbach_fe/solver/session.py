@@ -44,41 +44,27 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class RunSize:
-    """The size of a run of GetDP, from which its cost is estimated.
-
-    Attributes
-    ----------
-    route : str
-        Route of the solve, see `halbach_fe.solver.routes.choose_route`.
-    elements, unknowns : int
-    solves : int
-        Number of linear solves, without those of Newton's steps, whose number is not known in
-        advance.
-    matrices : int
-        Number of different matrices, also without those of Newton's steps.
-    newton : bool
-        Whether Newton's method solves for the field first.
-    """
+    """The size of a run of GetDP, from which its cost is estimated."""
 
     route: str
+    """Route of the solve, see `halbach_fe.solver.routes.choose_route`."""
     elements: int
     unknowns: int
     solves: int
+    """Number of linear solves, without those of Newton's steps, whose number is not known in
+    advance."""
     matrices: int = 1
+    """Number of different matrices, also without those of Newton's steps."""
     newton: bool = False
+    """Whether Newton's method solves for the field first."""
 
 
 @dataclass
 class RunCounter:
-    """Collects the runs that a computation would start.
-
-    Attributes
-    ----------
-    batches : list of (str, sequence of RunSize)
-        Purpose of the session, and the runs that it would start in parallel.
-    """
+    """Collects the runs that a computation would start."""
 
     batches: list[tuple[str, Sequence[RunSize]]] = field(default_factory=list)
+    """Purpose of the session, and the runs that it would start in parallel."""
 
 
 @dataclass(frozen=True)
@@ -249,33 +235,22 @@ MATRIX_FILE = "matrix.bin"
 
 @dataclass(frozen=True)
 class Task:
-    """One run of GetDP.
-
-    Attributes
-    ----------
-    name : str
-        Name of its folder.
-    stage : callable
-        Takes the run folder, fills it, and returns the job to run there.
-    read : callable
-        Takes the run folder after the run, verifies the result and returns it.
-    shape : tuple of int
-        Shape of the result.
-    solves : int
-        Number of solves that the run reports as progress.
-    size : RunSize
-        Size of the run, for estimates of its cost.
-    matrix : bool
-        Whether PETSc writes the matrix to `MATRIX_FILE`.
-    """
+    """One run of GetDP."""
 
     name: str
+    """Name of its folder."""
     stage: Callable[[Path], Job]
+    """Takes the run folder, fills it, and returns the job to run there."""
     read: Callable[[Path], Floats]
+    """Takes the run folder after the run, verifies the result and returns it."""
     shape: tuple[int, ...]
+    """Shape of the result."""
     solves: int
+    """Number of solves that the run reports as progress."""
     size: RunSize
+    """Size of the run, for estimates of its cost."""
     matrix: bool = False
+    """Whether PETSc writes the matrix to `MATRIX_FILE`."""
 
 
 def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
@@ -410,7 +385,6 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
 
     Parameters
     ----------
-    parent : Path
     name : str
         The folder is kept as ``name`` if the run succeeds, and as ``name-failed`` (with the log) if
         it raises a GetDPError. In all other cases, and if the run was cancelled, it is removed.

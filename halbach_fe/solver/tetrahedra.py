@@ -9,6 +9,14 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.threads import compiled
 
+NEAR, DEEPEST = 2.0, 8
+"""Distance of a point from an element, by the size of this, within which `add_field` divides it,
+and how often it does at most. At points of blocks that touch a yoke the error is 4e-5 of the field
+rms and 2e-4 at most; with 3 it is a twentieth, in three times as long, with 1.5 it is 5e-4 rms."""
+
+RESOLVED = NEAR / 2**DEEPEST
+"""Distance of a point from an element, by the size of this, from which `add_field` is exact."""
+
 
 @compiled
 def sweep(starts: Ints, columns: Ints, values: Floats, right: Floats, found: Floats,
@@ -93,9 +101,8 @@ def add_field(first: int, last: int, points: Floats, middle: Floats, reach: Floa
     reference, weights : ndarray, shapes (q, 3) and (q,)
         The rule of quadrature on the reference element.
     """
-    near, deepest = 3.0, 7
-    corners = np.empty((8 * deepest + 8, 4, 3))
-    depth = np.empty(8 * deepest + 8, np.int64)
+    corners = np.empty((8 * DEEPEST + 8, 4, 3))
+    depth = np.empty(8 * DEEPEST + 8, np.int64)
     value, slope = np.empty(10), np.empty((10, 3))
     middles = np.empty((6, 3))
     jacobian = np.empty((3, 3))
@@ -106,7 +113,7 @@ def add_field(first: int, last: int, points: Floats, middle: Floats, reach: Floa
         total[:] = 0.0
         for e in range(len(middle)):
             dx, dy, dz = x - middle[e, 0], y - middle[e, 1], z - middle[e, 2]
-            if dx * dx + dy * dy + dz * dz > (near * reach[e]) ** 2:
+            if dx * dx + dy * dy + dz * dz > (NEAR * reach[e]) ** 2:
                 for q in range(len(weights)):
                     _add_dipole(x - gauss[e, q, 0], y - gauss[e, q, 1], z - gauss[e, q, 2],
                                 dipoles[e, q, 0], dipoles[e, q, 1], dipoles[e, q, 2], total)
@@ -124,7 +131,7 @@ def add_field(first: int, last: int, points: Floats, middle: Floats, reach: Floa
                 dx, dy, dz = (x - _place(places[e], value, 0), y - _place(places[e], value, 1),
                               z - _place(places[e], value, 2))
                 size = reach[e] / 2.0**level
-                if dx * dx + dy * dy + dz * dz > (near * size) ** 2 or level == deepest:
+                if dx * dx + dy * dy + dz * dz > (NEAR * size) ** 2 or level == DEEPEST:
                     for q in range(len(weights)):
                         r = reference[q]
                         t = 1 - r[0] - r[1] - r[2]

@@ -29,19 +29,14 @@ class CovarianceFactor:
     A posterior keeps the outer root of its prior. Along each orthonormal direction V the readings
     reduce the standard deviation to the fraction ``remaining``; in all orthogonal directions it is
     unchanged. There may be far fewer readings, and so directions, than parameters.
-
-    Attributes
-    ----------
-    outer : ndarray or sparse array, shape (m, k)
-    directions : ndarray, shape (k, r)
-        V, with orthonormal columns; r = 0 for a prior.
-    remaining : ndarray, shape (r,)
-        Fraction of the standard deviation that remains along each direction.
     """
 
     outer: Floats | sparse.csr_array
+    """Shape (m, k)."""
     directions: Floats
+    """V, with orthonormal columns; r = 0 for a prior. Shape (k, r)."""
     remaining: Floats
+    """Fraction of the standard deviation that remains along each direction. Shape (r,)."""
 
     __array_ufunc__ = None  # numpy leaves `array @ factor` to __rmatmul__
 
@@ -101,18 +96,13 @@ def _row_square_sums(rows: Floats | sparse.csr_array) -> Floats:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A normal distribution, given by its mean and a root of its covariance.
-
-    Attributes
-    ----------
-    mean : ndarray, shape (m,)
-    root : ndarray or CovarianceFactor, shape (m, k)
-        Covariance = root @ root.T, with any k. For both types ``matrix @ root`` and
-        ``root @ values`` are arrays, and ``np.asarray(root)`` is the root as a dense array.
-    """
+    """A normal distribution, given by its mean and a root of its covariance."""
 
     mean: Floats
+    """Shape (m,)."""
     root: Floats | CovarianceFactor
+    """Covariance = root @ root.T, with any k. For both types ``matrix @ root`` and ``root @
+    values`` are arrays, and ``np.asarray(root)`` is the root as a dense array. Shape (m, k)."""
 
     @property
     def covariance(self) -> Floats:

@@ -28,7 +28,7 @@ import numpy as np
 import scipy.linalg as linalg
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.noise import NoiseCovariance
 
@@ -66,56 +66,38 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class LinearPosterior:
-    """The posterior of the parameters of a linear model.
-
-    Attributes
-    ----------
-    distribution : Gaussian
-        Posterior distribution. Its root has as many columns as the prior's.
-    log_evidence : float
-        Log evidence: logarithm of the probability density of the readings under prior and noise.
-    parameters_learnt : float
-        Effective number of parameters that the readings determine: the trace of I - S^-1, where S
-        is the posterior precision of z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
-    prior_conflict : float
-        Chi-squared per reading, ``r' (Sigma + H C_0 H')^-1 r / n``, of the residuals r of the
-        prior's prediction. If prior, model and noise are right, its expectation is 1 and its
-        standard deviation sqrt(2/n).
-    discarded_information : float
-        Upper bound of the relative change of the posterior variance of any combination of
-        parameters because negligible combinations of readings were discarded; 0 if none were.
-    """
+    """The posterior of the parameters of a linear model."""
 
     distribution: Gaussian
+    """Posterior distribution. Its root has as many columns as the prior's."""
     log_evidence: float
+    """Log evidence: logarithm of the probability density of the readings under prior and noise."""
     parameters_learnt: float
+    """Effective number of parameters that the readings determine: the trace of I - S^-1, where S is
+    the posterior precision of z (D. J. C. MacKay, Neural Comput. 4 (1992) 415)."""
     prior_conflict: float
+    """Chi-squared per reading, ``r' (Sigma + H C_0 H')^-1 r / n``, of the residuals r of the
+    prior's prediction. If prior, model and noise are right, its expectation is 1 and its standard
+    deviation sqrt(2/n)."""
     discarded_information: float
+    """Upper bound of the relative change of the posterior variance of any combination of parameters
+    because negligible combinations of readings were discarded; 0 if none were."""
 
 
 @dataclass(frozen=True)
 class Information:
-    """The information of readings y = W z + e, e ~ N(0, I), about z, where W = U diag(s) V'.
-
-    Attributes
-    ----------
-    directions : ndarray, shape (k, r)
-        V.
-    values : ndarray, shape (r,)
-        Singular values s.
-    projected : ndarray, shape (r,)
-        V' W' y.
-    chi2 : float
-        y' (I + W W')^-1 y.
-    discarded : float
-        Sum of the squares of the singular values that were discarded as negligible.
-    """
+    """The information of readings y = W z + e, e ~ N(0, I), about z, where W = U diag(s) V'."""
 
     directions: Floats
+    """V. Shape (k, r)."""
     values: Floats
+    """Singular values s. Shape (r,)."""
     projected: Floats
+    """V' W' y. Shape (r,)."""
     chi2: float
+    """y' (I + W W')^-1 y."""
     discarded: float = 0.0
+    """Sum of the squares of the singular values that were discarded as negligible."""
 
 
 def update(
@@ -210,14 +192,14 @@ def _selected(matrix: Rows, indices: Ints) -> Floats:
     return matrix[indices]
 
 
-def row_slices(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
+def row_slices(count: int, columns: int, most: int | None = None) -> list[slice]:
     """Return slices that divide the rows of a matrix (count, columns) into blocks.
 
     A block has at most ``most`` rows (default: `READINGS_AT_ONCE`) and, unless it is a single row,
     at most `NUMBERS_AT_ONCE` entries.
     """
     step = min(most or READINGS_AT_ONCE, max(1, NUMBERS_AT_ONCE // max(1, columns)))
-    return (slice(first, min(first + step, count)) for first in range(0, count, step))
+    return slices(count, step)
 
 
 def information_of(

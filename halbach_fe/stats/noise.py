@@ -140,10 +140,8 @@ class NoiseCovariance:
     def conditional(self, rows: Rows, seen: Rows) -> tuple[sparse.csr_array, NoiseCovariance]:
         """Condition the noise of some readings on the noise of others.
 
-        Parameters
-        ----------
-        rows, seen : slice or ndarray
-            The readings whose noise is predicted, and the disjoint readings whose noise is known.
+        ``rows`` and ``seen``: the readings whose noise is predicted, and the disjoint readings
+        whose noise is known.
 
         Returns
         -------

@@ -39,26 +39,18 @@ Model = Callable[[Floats], Floats]
 
 @dataclass
 class Posterior:
-    """The unnormalized posterior of a model, which the chain samples.
-
-    Attributes
-    ----------
-    model : callable
-        Maps parameters (m,) to readings (n,) in T.
-    readings : ndarray, shape (n,), in T
-    noise : NoiseCovariance
-        Noise of the n readings.
-    prior : Gaussian
-        Prior of the m parameters.
-    solves : int
-        Number of evaluations of the log likelihood so far; each solves the model once.
-    """
+    """The unnormalized posterior of a model, which the chain samples."""
 
     model: Model
+    """Maps parameters (m,) to readings (n,) in T."""
     readings: Floats
+    """Shape (n,), in T."""
     noise: NoiseCovariance
+    """Noise of the n readings."""
     prior: Gaussian
+    """Prior of the m parameters."""
     solves: int = field(default=0, init=False)
+    """Number of evaluations of the log likelihood so far; each solves the model once."""
 
     def log_likelihood(self, parameters: Floats) -> float:
         """Return the log likelihood of parameters (m,), up to a constant."""
@@ -72,17 +64,13 @@ class ReferenceMeasure:
     """A Gaussian reference measure in the prior's whitened coordinates z, p = mu_0 + L z.
 
     ``z = centre + root xi`` is distributed like the reference if xi is standard normal.
-
-    Attributes
-    ----------
-    centre : ndarray, shape (k,)
-    root, inverse : ndarray, shape (k, k)
-        Square root of the covariance of z, and the inverse of this root.
     """
 
     centre: Floats
+    """Shape (k,)."""
     root: Floats
     inverse: Floats
+    """Square root of the covariance of z, and the inverse of this root. Shape (k, k)."""
 
     def to_z(self, xi: Floats) -> Floats:
         """Return z (k,) of the reference coordinates xi (k,)."""
@@ -107,11 +95,7 @@ def laplace(
     The mode is found by Gauss-Newton steps, which are halved until the posterior density increases;
     the covariance is the inverse of the Gauss-Newton Hessian at the mode.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    jacobian : callable
-        Maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
+    ``jacobian``: maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
 
     Returns
     -------
@@ -155,37 +139,25 @@ def laplace(
 
 @dataclass(frozen=True)
 class Proposal:
-    """A proposal that leaves its reference measure invariant, ``xi' = sqrt(1 - s^2) xi + s eta``.
-
-    Attributes
-    ----------
-    reference : ReferenceMeasure
-        Measure in whose coordinates xi the step is taken.
-    step : float
-        Step size s in (0, 1].
-    """
+    """A proposal that keeps its reference measure, ``xi' = sqrt(1 - s^2) xi + s eta``."""
 
     reference: ReferenceMeasure
+    """Measure in whose coordinates xi the step is taken."""
     step: float
+    """Step size s in (0, 1]."""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A Markov chain of samples.
-
-    Attributes
-    ----------
-    samples : ndarray, shape (steps, m)
-        Parameters after each step.
-    accepted : float
-        Fraction of the proposals that were accepted.
-    last : ndarray, shape (k,)
-        Whitened coordinates z of the last sample, from which the chain can be continued.
-    """
+    """A Markov chain of samples."""
 
     samples: Floats
+    """Parameters after each step. Shape (steps, m)."""
     accepted: float
+    """Fraction of the proposals that were accepted."""
     last: Floats
+    """Whitened coordinates z of the last sample, from which the chain can be continued.
+    Shape (k,)."""
 
 
 def sample(
@@ -202,10 +174,8 @@ def sample(
     ----------
     posterior : Posterior
         Distribution to sample.
-    proposals : sequence of Proposal
     count : int
         Number of steps; each gives a sample.
-    generator : numpy.random.Generator
     start : ndarray, shape (k,)
         Whitened coordinates z at which the chain starts.
     surrogate : Posterior, optional
@@ -255,26 +225,18 @@ sample size with which R-hat and the quantiles can be trusted."""
 
 @dataclass(frozen=True)
 class ConvergenceDiagnostics:
-    """Convergence diagnostics of each of m parameters.
-
-    Attributes
-    ----------
-    r_hat : ndarray, shape (m,)
-        Rank-normalized split R-hat.
-    bulk, tail : ndarray, shape (m,)
-        Effective sample sizes for the mean, and for the 5 and 95 % quantiles.
-    mcse : ndarray, shape (m,)
-        Monte Carlo standard error of the mean, in the parameter's unit.
-    chains, samples : int
-        Number of chains, and of the samples of all chains together.
-    """
+    """Convergence diagnostics of each of m parameters."""
 
     r_hat: Floats
+    """Rank-normalized split R-hat. Shape (m,)."""
     bulk: Floats
     tail: Floats
+    """Effective sample sizes for the mean, and for the 5 and 95 % quantiles. Shape (m,)."""
     mcse: Floats
+    """Monte Carlo standard error of the mean, in the parameter's unit. Shape (m,)."""
     chains: int
     samples: int
+    """Number of chains, and of the samples of all chains together."""
 
 
 def assess_convergence(samples: Floats) -> ConvergenceDiagnostics:
@@ -300,7 +262,6 @@ def require_convergence(
 
     Parameters
     ----------
-    found : ConvergenceDiagnostics
     names : sequence of str
         Names of the parameters, for the error message.
     effective : float

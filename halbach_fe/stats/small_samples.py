@@ -81,10 +81,7 @@ def predictive_covariance(samples: Floats) -> tuple[Floats, float]:
     between 0.4 and 1.5 for single components whose true standard deviations differed by a factor of
     five.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n, d)
-        At least three samples.
+    ``samples`` (n, d): at least three samples.
 
     Returns
     -------
@@ -209,7 +206,6 @@ def ranks(
         The inference under test, see `Sampler`.
     repeats : int
         Number of simulated inferences.
-    generator : numpy.random.Generator
     progress : callable
         Called with the number of completed inferences and with ``repeats``.
 
@@ -259,19 +255,12 @@ def uniformity(found: Ints, draws: int) -> tuple[Floats, float]:
 
 @dataclass(frozen=True)
 class Bin:
-    """Statements whose probabilities are similar.
-
-    Attributes
-    ----------
-    stated : float
-        Mean of the stated probabilities.
-    happened : float
-        Fraction of the statements that were true.
-    statements : int
-    """
+    """Statements whose probabilities are similar."""
 
     stated: float
+    """Mean of the stated probabilities."""
     happened: float
+    """Fraction of the statements that were true."""
     statements: int
 
 

@@ -58,17 +58,10 @@ class _Content:
 def read_free_blocks(path: str | Path) -> dict[str, list[Cell]]:
     """Read the columns of a table of free blocks; None stands for empty cells.
 
-    Parameters
-    ----------
-    path : str or Path
-        A CSV file with a header of names from `halbach_fe.study.free_blocks.COLUMNS` in any order,
-        in UTF-8; lines that begin with ``#`` are comments. Or an HDF5 file (suffix .h5, .hdf5 or
-        .nc) with a dataset (n,) per column; NaN and empty text stand for empty cells. A cell of
-        ``outline_m`` lists corners: ``0 0; 0.01 0; 0 0.02``.
-
-    Returns
-    -------
-    dict of list
+    ``path``: a CSV file with a header of names from `halbach_fe.study.free_blocks.COLUMNS` in any
+    order, in UTF-8; lines that begin with ``#`` are comments. Or an HDF5 file (suffix .h5, .hdf5 or
+    .nc) with a dataset (n,) per column; NaN and empty text stand for empty cells. A cell of
+    ``outline_m`` lists corners: ``0 0; 0.01 0; 0 0.02``.
 
     Raises
     ------

@@ -49,52 +49,35 @@ at most 4 % of a SmCo5 of 13 MGOe."""
 
 @dataclass(frozen=True)
 class Grade:
-    """A grade of magnet at room temperature, as its data sheet describes it.
-
-    Attributes
-    ----------
-    name : str
-    aliases : tuple of str
-        Other names of the same grade.
-    family : str
-        One of `FAMILIES`.
-    remanence_T : tuple
-        Smallest and largest remanence in T.
-    normal_coercivity_A_per_m, intrinsic_coercivity_A_per_m : float
-        Smallest H_cB and H_cJ.
-    energy_product_J_per_m3 : tuple
-        Smallest and largest (BH)_max.
-    recoil_permeability : float
-        Typical relative permeability along the easy axis.
-    remanence_coefficient_per_K, coercivity_coefficient_per_K : float or None
-        Typical temperature coefficients of the remanence and of H_cJ as fractions.
-    coefficient_range_C : tuple or None
-        Temperatures between which the coefficients hold, where the source says so.
-    max_temperature_C : float
-        Maximum working temperature; it depends on the magnet's shape, so that it is a hint only.
-    density_kg_per_m3 : tuple
-        Smallest and largest density.
-    source : str
-        Document of the magnetic ranges.
-    other_sources : tuple of str
-        Documents of what the first does not give.
-    """
+    """A grade of magnet at room temperature, as its data sheet describes it."""
 
     name: str
     aliases: tuple[str, ...]
+    """Other names of the same grade."""
     family: str
+    """One of `FAMILIES`."""
     remanence_T: tuple[float, float]
+    """Smallest and largest remanence in T."""
     normal_coercivity_A_per_m: float
     intrinsic_coercivity_A_per_m: float
+    """Smallest H_cB and H_cJ."""
     energy_product_J_per_m3: tuple[float, float]
+    """Smallest and largest (BH)_max."""
     recoil_permeability: float
+    """Typical relative permeability along the easy axis."""
     remanence_coefficient_per_K: float | None
     coercivity_coefficient_per_K: float | None
+    """Typical temperature coefficients of the remanence and of H_cJ as fractions."""
     coefficient_range_C: tuple[float, float] | None
+    """Temperatures between which the coefficients hold, where the source says so."""
     max_temperature_C: float
+    """Maximum working temperature; it depends on the magnet's shape, so that it is a hint only."""
     density_kg_per_m3: tuple[float, float]
+    """Smallest and largest density."""
     source: str
+    """Document of the magnetic ranges."""
     other_sources: tuple[str, ...] = ()
+    """Documents of what the first does not give."""
 
     @property
     def nominal_remanence(self) -> float:

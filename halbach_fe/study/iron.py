@@ -319,12 +319,7 @@ class IronPrism(PlacedIron):
 
 
 def _check_holes(outline: Floats, holes: list[Floats]) -> None:
-    """Refuse holes that do not lie apart, within the outline (n, 2).
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse holes that do not lie apart, within the outline (n, 2)."""
     for number, hole in enumerate(holes):
         others = [outline, *holes[:number]]
         if any(_edges_meet(hole, other) for other in others) or not _within(
@@ -466,10 +461,6 @@ def _check_cavities(triangles: Floats, shell: Ints, volumes: Floats) -> None:
     """Refuse shells of triangles (n, 3, 3) but an outer one and its cavities.
 
     ``shell`` (n,) is that of each triangle, and ``volumes`` (shells,) have the sign of its normals.
-
-    Raises
-    ------
-    ValueError
     """
     if (volumes > 0).sum() > 1:
         raise ValueError(f"it has {(volumes > 0).sum()} closed shells with normals outwards, but a "

@@ -59,20 +59,14 @@ class ConstitutiveLaw:
 
     The coefficient c is interpolated by Akima's method; beyond the last point d|y|/d|x| is
     constant.
-
-    Attributes
-    ----------
-    squares : ndarray, shape (n,), in T^2
-        Values of |x|^2, ascending from 0.
-    values : ndarray, shape (n,)
-        The coefficient c at ``squares``.
-    limit : float
-        d|y|/d|x| beyond the last point.
     """
 
     squares: Floats
+    """Values of |x|^2, ascending from 0. Shape (n,), in T^2."""
     values: Floats
+    """The coefficient c at ``squares``. Shape (n,)."""
     limit: float
+    """d|y|/d|x| beyond the last point."""
 
     @property
     def excess(self) -> float:
@@ -128,21 +122,14 @@ def _akima_slopes(x: Floats, y: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of a magnetization curve that are close enough for both constitutive laws.
-
-    Attributes
-    ----------
-    H : ndarray, shape (n,), in A/m
-        Ascending from 0.
-    B : ndarray, shape (n,), in T
-        Ascending from 0.
-    initial : float
-        Relative permeability at the origin.
-    """
+    """Points of a magnetization curve that are close enough for both constitutive laws."""
 
     H: Floats
+    """Ascending from 0. Shape (n,), in A/m."""
     B: Floats
+    """Ascending from 0. Shape (n,), in T."""
     initial: float
+    """Relative permeability at the origin."""
 
     @cached_property
     def reluctivity(self) -> ConstitutiveLaw:

@@ -258,10 +258,10 @@ class NoiseSettings(StudyModel):
     """Standard deviation of the readings, and of their positions.
 
     ``regions`` give the standard deviation of a reading; a map with a sigma of its own replaces
-    them. ``position_sd_m`` is the standard deviation of every point's position along x, y and z (a
-    single value holds for all three). The position uncertainty adds to the noise of both: it
-    changes the readings of a point by the local gradient of the field, all components of the point
-    together, which is much in the fringe field and little in the homogeneous field.
+    them. ``position_sd_m`` is the standard deviation of every point's position along x, y and z of
+    the stage (a single value holds for all three). The position uncertainty adds to the noise of
+    both: it changes the readings of a point by the local gradient of the field, all components of
+    the point together, which is much in the fringe field and little in the homogeneous field.
     """
 
     regions: tuple[NoiseRegion, ...] = ()

@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, slices
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import sentences
 
@@ -223,8 +223,8 @@ def crossing(polygons: Floats) -> Bools:
     first, second = first[apart], second[apart]
     found = np.zeros(len(polygons), bool)
     step = max(1, MAX_PAIRS // count**2)
-    for start in range(0, len(polygons), step):
-        corners = polygons[start:start + step] @ [1, 1j]  # Im(conj(a) b) is the cross product
+    for part in slices(len(polygons), step):
+        corners = polygons[part] @ [1, 1j]  # Im(conj(a) b) is the cross product
         corners = corners - corners.mean(axis=1, keepdims=True)
         ends = np.roll(corners, -1, axis=1)
         tiny = 1e-12 * np.abs(corners).max(axis=1) ** 2  # rounding of products of coordinates
@@ -238,7 +238,7 @@ def crossing(polygons: Floats) -> Bools:
             sides = [(np.conj(b - a) * (point - a)).imag for point in others]
             opposite.append((np.minimum(*sides) < -tiny[:, None])
                             & (np.maximum(*sides) > tiny[:, None]))
-        found[start:start + step] = wrong | (opposite[0] & opposite[1]).any(axis=1)
+        found[part] = wrong | (opposite[0] & opposite[1]).any(axis=1)
     return found
 
 

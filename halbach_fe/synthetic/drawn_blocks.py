@@ -46,21 +46,14 @@ def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
 
 @dataclass(frozen=True)
 class DrawnMagnet:
-    """A magnet whose blocks have the errors that were drawn for them.
-
-    Attributes
-    ----------
-    single : TrueMagnet
-        The blocks before they are mounted.
-    turns : tuple of Rotation
-        Error of the mounting in each place, along the magnet's axes.
-    common : float
-        Deviation that all magnetizations have in common, relative to the nominal.
-    """
+    """A magnet whose blocks have the errors that were drawn for them."""
 
     single: TrueMagnet
+    """The blocks before they are mounted."""
     turns: tuple[Rotation, ...]
+    """Error of the mounting in each place, along the magnet's axes."""
     common: float
+    """Deviation that all magnetizations have in common, relative to the nominal."""
 
     @property
     def mounted(self) -> TrueMagnet:

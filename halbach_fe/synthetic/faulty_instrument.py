@@ -27,79 +27,57 @@ IDEAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class FaultyInstrument:
-    """Faults of a mapper; the default has none. Lengths are in m, angles in rad, fields in T.
-
-    Attributes
-    ----------
-    translation, rotation : tuple
-        Displacement and rotation vector (about the origin) of the whole mapper, the axes of the
-        probe included, along the magnet's axes.
-    z_scale, radius_scale : float
-        The true z or radius is the recorded one times 1 plus this number.
-    radius_error : float
-        Length that is added to the true radius; on the axis it points along x.
-    run_out : tuple
-        Amplitude d and angle phi_0 of a radius that varies as r + d cos(phi - phi_0).
-    sag : tuple
-        Sag of the arm's far end towards -y, and the z of its near and far end. The arm sags with
-        the square of the distance from its near end.
-    vibration : float
-        Standard deviation of the probe's position along each axis.
-    lag : float
-        Distance by which the probe is behind on its way along a line. Where a line begins the stage
-        has stopped.
-    sensors : tuple of three tuples
-        Displacements of the sensors of B_x, B_y and B_z, along the mapper's axes.
-    axes : tuple of three tuples
-        ``axes[i][j]`` is the sensitivity of sensor i to component j.
-    planar_hall, quadratic, cubic : float
-        Coefficients in 1/T, 1/T and 1/T^2. Sensor i adds planar_hall times the product of the two
-        other components, and quadratic times the square and cubic times the third power of its
-        reading.
-    gain, offset : tuple
-        A sensor shows (1 + gain) times its reading, plus the offset.
-    drift : float
-        Growth of all readings from the first to the last point of the map, linear in time.
-    gain_drift : float
-        Growth of all sensitivities, or of the field of a magnet that gets colder, as a fraction.
-    memory : tuple
-        Fraction of every reading that comes from those before, and number of rows within which
-        these are forgotten; 0 if it is the last one alone.
-    outliers : tuple
-        Fraction of the readings that are outliers, and their typical deviation.
-    reversed_z : bool
-        Whether the probe is at -z when z is recorded.
-    order, signs : tuple
-        Number of the sensor that is recorded as each component, and the sign it is given.
-    length_unit, field_unit : float
-        Recorded number per metre and per tesla, such as 1000 for a record in mm or mT.
-    """
+    """Faults of a mapper; the default has none. Lengths are in m, angles in rad, fields in T."""
 
     translation: Vector = ZERO_VECTOR
     rotation: Vector = ZERO_VECTOR
+    """Displacement and rotation vector (about the origin) of the whole mapper, the axes of the
+    probe included, along the magnet's axes."""
     z_scale: float = 0.0
     radius_scale: float = 0.0
+    """The true z or radius is the recorded one times 1 plus this number."""
     radius_error: float = 0.0
+    """Length that is added to the true radius; on the axis it points along x."""
     run_out: tuple[float, float] = (0.0, 0.0)
+    """Amplitude d and angle phi_0 of a radius that varies as r + d cos(phi - phi_0)."""
     sag: Vector = ZERO_VECTOR
+    """Sag of the arm's far end towards -y, and the z of its near and far end. The arm sags with the
+    square of the distance from its near end."""
     vibration: float = 0.0
+    """Standard deviation of the probe's position along each axis."""
     lag: float = 0.0
+    """Distance by which the probe is behind on its way along a line. Where a line begins the stage
+    has stopped."""
     sensors: tuple[Vector, Vector, Vector] = (ZERO_VECTOR, ZERO_VECTOR, ZERO_VECTOR)
+    """Displacements of the sensors of B_x, B_y and B_z, along the mapper's axes."""
     axes: tuple[Vector, Vector, Vector] = IDEAL_AXES
+    """``axes[i][j]`` is the sensitivity of sensor i to component j."""
     planar_hall: float = 0.0
     quadratic: float = 0.0
     cubic: float = 0.0
+    """Coefficients in 1/T, 1/T and 1/T^2. Sensor i adds planar_hall times the product of the two
+    other components, and quadratic times the square and cubic times the third power of its
+    reading."""
     gain: Vector = ZERO_VECTOR
     offset: Vector = ZERO_VECTOR
+    """A sensor shows (1 + gain) times its reading, plus the offset."""
     drift: float = 0.0
+    """Growth of all readings from the first to the last point of the map, linear in time."""
     gain_drift: float = 0.0
+    """Growth of all sensitivities, or of the field of a magnet that gets colder, as a fraction."""
     memory: tuple[float, float] = (0.0, 0.0)
+    """Fraction of every reading that comes from those before, and number of rows within which these
+    are forgotten; 0 if it is the last one alone."""
     outliers: tuple[float, float] = (0.0, 0.0)
+    """Fraction of the readings that are outliers, and their typical deviation."""
     reversed_z: bool = False
+    """Whether the probe is at -z when z is recorded."""
     order: tuple[int, int, int] = (0, 1, 2)
     signs: Vector = (1.0, 1.0, 1.0)
+    """Number of the sensor that is recorded as each component, and the sign it is given."""
     length_unit: float = 1.0
     field_unit: float = 1.0
+    """Recorded number per metre and per tesla, such as 1000 for a record in mm or mT."""
 
     def places(self, points: Floats, generator: np.random.Generator) -> Floats:
         """Return the true positions of the three sensors, (3, n, 3) in m.
@@ -211,7 +189,6 @@ def stated_readings(instrument: Instrument, fields: Floats, time: Floats) -> Flo
 
     Parameters
     ----------
-    instrument : Instrument
     fields : ndarray, shape (3, n, 3), in T
         B at the place of each sensor, along the axes of the magnet.
     time : ndarray, shape (n,)

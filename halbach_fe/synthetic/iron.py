@@ -20,33 +20,22 @@ from halbach_fe.synthetic.shapes import PolygonBody, Vector, shoelace
 
 @dataclass(frozen=True)
 class FroehlichLaw:
-    """The Froehlich-Kennelly law of iron, B = mu_0 H + J_s H / (H + h).
-
-    Attributes
-    ----------
-    initial : float
-        Initial relative permeability, from which h follows.
-    saturation : float, in T
-        Saturation polarization J_s.
-    """
+    """The Froehlich-Kennelly law of iron, B = mu_0 H + J_s H / (H + h)."""
 
     initial: float
+    """Initial relative permeability, from which h follows."""
     saturation: float
+    """Saturation polarization J_s. In T."""
 
 
 @dataclass(frozen=True)
 class TableLaw:
-    """An H(B) table of iron.
-
-    Attributes
-    ----------
-    field, flux_density : tuple of float
-        H in A/m and B in T, rising from 0. The polarization J = B - mu_0 H is constant beyond the
-        last entry.
-    """
+    """An H(B) table of iron."""
 
     field: tuple[float, ...]
     flux_density: tuple[float, ...]
+    """H in A/m and B in T, rising from 0. The polarization J = B - mu_0 H is constant beyond the
+    last entry."""
 
 
 IronLaw = float | FroehlichLaw | TableLaw
@@ -55,20 +44,14 @@ IronLaw = float | FroehlichLaw | TableLaw
 
 @dataclass(frozen=True, kw_only=True)
 class IronShape:
-    """What all bodies of iron have: a place, and perhaps a material of their own.
-
-    Attributes
-    ----------
-    origin, turn : tuple of float, in m and rad
-        Place of the origin of the body's own axes, and the rotation vector that turns the magnet's
-        axes into them.
-    law : IronLaw, optional
-        Its own material.
-    """
+    """What all bodies of iron have: a place, and perhaps a material of their own."""
 
     origin: Vector = (0.0, 0.0, 0.0)
     turn: Vector = (0.0, 0.0, 0.0)
+    """Place of the origin of the body's own axes, and the rotation vector that turns the magnet's
+    axes into them. In m and rad."""
     law: IronLaw | None = None
+    """Its own material."""
 
     def in_own_axes(self, points: Floats) -> Floats:
         """Return the coordinates (n, 3) in m, in the body's axes, of points (n, 3) in m."""
@@ -77,22 +60,15 @@ class IronShape:
 
 @dataclass(frozen=True)
 class Tube(IronShape):
-    """An iron tube about its z axis; a disc if its inner radius is 0.
-
-    Attributes
-    ----------
-    inner, outer : float, in m
-        Radii.
-    half_length : float, in m
-        Distance from the middle to each end.
-    middle : float, in m
-        Position of the middle along z.
-    """
+    """An iron tube about its z axis; a disc if its inner radius is 0."""
 
     inner: float
     outer: float
+    """Radii. In m."""
     half_length: float
+    """Distance from the middle to each end. In m."""
     middle: float = 0.0
+    """Position of the middle along z. In m."""
 
     def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
@@ -104,21 +80,14 @@ class Tube(IronShape):
 
 @dataclass(frozen=True)
 class Pole(IronShape):
-    """A prism of iron along its z axis.
-
-    Attributes
-    ----------
-    outline : tuple of complex, in m
-        Corners x + iy of its section, counter-clockwise.
-    half_length : float, in m
-        Distance from the middle to each end.
-    middle : float, in m
-        Position of the middle along z.
-    """
+    """A prism of iron along its z axis."""
 
     outline: tuple[complex, ...]
+    """Corners x + iy of its section, counter-clockwise. In m."""
     half_length: float
+    """Distance from the middle to each end. In m."""
     middle: float = 0.0
+    """Position of the middle along z. In m."""
 
     def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, slices
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.pace import Progress
@@ -132,24 +132,16 @@ def no_progress(done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class _Task:
-    """A field to compute, and the bodies that use it.
-
-    Attributes
-    ----------
-    piece : Piece
-    polarizations : ndarray, shape (k, 3), in T
-        Polarizations of the piece for which the field is computed.
-    points : ndarray, shape (n, 3), in m
-        Points in the piece's own axes.
-    users : tuple
-        For each body that uses the field: its number, the index of its points among ``points``,
-        and its weights (k,) of the polarizations; None stands for a weight of 1.
-    """
+    """A field to compute, and the bodies that use it."""
 
     piece: Piece
     polarizations: Floats
+    """Polarizations of the piece for which the field is computed. Shape (k, 3), in T."""
     points: Floats
+    """Points in the piece's own axes. Shape (n, 3), in m."""
     users: tuple[tuple[int, Any, Floats | None], ...]
+    """For each body that uses the field: its number, the index of its points among ``points``, and
+    its weights (k,) of the polarizations; None stands for a weight of 1."""
 
 
 def vacuum_field(
@@ -193,8 +185,8 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> Iterator[_Task]:
                 (number, (part.factor - 1) * remanence))
     at_once = max(1, searched // len(points))
     for piece, members in groups.items():
-        for first in range(0, len(members), at_once):
-            yield from _tasks(piece, members[first:first + at_once], bodies, points)
+        for some in slices(len(members), at_once):
+            yield from _tasks(piece, members[some], bodies, points)
 
 
 def _tasks(

@@ -51,23 +51,16 @@ without such elements, and is by 4 uT."""
 
 @dataclass(frozen=True)
 class Elements:
-    """How finite elements resolve a magnet.
-
-    Attributes
-    ----------
-    size : float, optional, in m
-        Largest element size in the magnet; by default a third of the blocks' thickness in three
-        dimensions, a sixth in two; less at the ends of iron tubes, see `END_SIZE`, and half as
-        much in other iron: beside plates of 8 mm the error fell from 1.2e-4 T to 2.2e-5 T rms.
-    order : int, optional
-        Polynomial order of the potential; by default 3 in three dimensions and 5 in two.
-    grading : float
-        Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast).
-    """
+    """How finite elements resolve a magnet."""
 
     size: float | None = None
+    """Largest element size in the magnet; by default a third of the blocks' thickness in three
+    dimensions, a sixth in two; less at the ends of iron tubes, see `END_SIZE`, and half as much in
+    other iron: beside plates of 8 mm the error fell from 1.2e-4 T to 2.2e-5 T rms. In m."""
     order: int | None = None
+    """Polynomial order of the potential; by default 3 in three dimensions and 5 in two."""
     grading: float = 0.3
+    """Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast)."""
 
 
 def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None = None) -> Floats:

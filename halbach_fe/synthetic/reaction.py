@@ -54,22 +54,15 @@ NODES = {100: 6, 400: 4, 1500: 3}
 
 @dataclass(frozen=True)
 class _Block:
-    """A body with its Gauss points.
-
-    Attributes
-    ----------
-    body : Body
-    nodes : ndarray, shape (n, 3), in m
-        Along the magnet's axes.
-    volumes : ndarray, shape (n,), in m^3
-    answer : ndarray, shape (3, 3)
-        ``mu_r - 1`` along the magnet's axes.
-    """
+    """A body with its Gauss points."""
 
     body: Body
     nodes: Floats
+    """Along the magnet's axes. Shape (n, 3), in m."""
     volumes: Floats
+    """Shape (n,), in m^3."""
     answer: Floats
+    """``mu_r - 1`` along the magnet's axes. Shape (3, 3)."""
 
     def mean(self, values: Floats) -> Floats:
         """Return the mean over the block of values at its nodes, (n, ...)."""

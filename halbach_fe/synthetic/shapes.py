@@ -27,22 +27,15 @@ divide the arcs count as corners.
 
 @dataclass(frozen=True)
 class SectorBody:
-    """A sector of a tube, whose axis is at x = -(inner + outer) / 2 in the shape's own axes.
-
-    Attributes
-    ----------
-    inner, outer : float, in m
-        Radii.
-    half_angle : float, in rad
-        Half of the angle that the sector spans.
-    length : float, in m
-        Length along z; infinite in two dimensions.
-    """
+    """A sector of a tube, whose axis is at x = -(inner + outer) / 2 in the shape's own axes."""
 
     inner: float
     outer: float
+    """Radii. In m."""
     half_angle: float
+    """Half of the angle that the sector spans. In rad."""
     length: float
+    """Length along z; infinite in two dimensions. In m."""
 
     @property
     def middle(self) -> float:
@@ -114,25 +107,17 @@ class SectorBody:
 
 @dataclass(frozen=True)
 class PrismBody:
-    """A trapezoidal prism or a cuboid.
-
-    Attributes
-    ----------
-    depth : float, in m
-        Extent along x.
-    inner_width, outer_width : float, in m
-        Extents along y at the inner and the outer face.
-    length : float, in m
-        Length along z; infinite in two dimensions.
-    turn : float, in rad
-        Angle about z by which the prism is turned relative to the shape's own axes.
-    """
+    """A trapezoidal prism or a cuboid."""
 
     depth: float
+    """Extent along x. In m."""
     inner_width: float
     outer_width: float
+    """Extents along y at the inner and the outer face. In m."""
     length: float
+    """Length along z; infinite in two dimensions. In m."""
     turn: float = 0.0
+    """Angle about z by which the prism is turned relative to the shape's own axes. In rad."""
 
     has_four_edges = True
     pivot = 0j

@@ -121,7 +121,6 @@ def simulate_campaign(
 
     Parameters
     ----------
-    study : Study
     seed : int
         Seed of all random numbers.
     coil_sd : float

@@ -47,82 +47,55 @@ class BodyPart:
 
 @dataclass(frozen=True)
 class LostCell:
-    """A part of a body that has lost a part of its remanence.
-
-    Attributes
-    ----------
-    body : Body
-        The block, or a slice of it along z.
-    u, v : Fractions
-        Limits of the cell in the body, see `BodyPart`.
-    part : float
-        Part of the remanence that is lost.
-    """
+    """A part of a body that has lost a part of its remanence."""
 
     body: Body
+    """The block, or a slice of it along z."""
     u: Fractions
     v: Fractions
+    """Limits of the cell in the body, see `BodyPart`."""
     part: float
+    """Part of the remanence that is lost."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """One block of magnet material.
-
-    Attributes
-    ----------
-    ring, slot : int
-        Place of the block in the array, both counted from 1.
-    shape : Shape
-    angle : float, in rad
-        Angle about z of the body's own x axis, before ``rotation``.
-    centre : tuple, in m
-        Position of the body's origin, before ``displacement``.
-    remanence : tuple, in T
-        B_r in the body's own axes.
-    easy_axis : tuple
-        Unit vector in the body's own axes.
-    along, across : float
-        Relative recoil permeability along and across the easy axis.
-    displacement : tuple, in m
-        Along the magnet's axes.
-    rotation : tuple, in rad
-        Rotation vector about the body's origin, along the magnet's axes.
-    parts : tuple of BodyPart
-        Parts with another magnetization.
-    meshed_shape : Shape, optional
-        Shape that the finite elements use instead of ``shape``. It is given where gaps between the
-        true shapes would be too narrow for a mesh to resolve.
-    seat : tuple, in rad
-        Rotation vector that turns the body's own axes into those of its shape.
-    name : str
-        Name of a block that is not part of a ring.
-    type : str
-        Type of block that the study gives; empty if it gives none.
-    factor : float
-        Factor of the magnetization that the block got when, or after, it was mounted.
-    made_for : tuple of int, optional
-        Ring and slot that the block was made for, if that is another place.
-    """
+    """One block of magnet material."""
 
     ring: int
     slot: int
+    """Place of the block in the array, both counted from 1."""
     shape: Shape
     angle: float
+    """Angle about z of the body's own x axis, before ``rotation``. In rad."""
     centre: Vector
+    """Position of the body's origin, before ``displacement``. In m."""
     remanence: Vector
+    """B_r in the body's own axes. In T."""
     easy_axis: Vector
+    """Unit vector in the body's own axes."""
     along: float = 1.0
     across: float = 1.0
+    """Relative recoil permeability along and across the easy axis."""
     displacement: Vector = ZERO_VECTOR
+    """Along the magnet's axes. In m."""
     rotation: Vector = ZERO_VECTOR
+    """Rotation vector about the body's origin, along the magnet's axes. In rad."""
     parts: tuple[BodyPart, ...] = ()
+    """Parts with another magnetization."""
     meshed_shape: Shape | None = None
+    """Shape that the finite elements use instead of ``shape``. It is given where gaps between the
+    true shapes would be too narrow for a mesh to resolve."""
     seat: Vector = ZERO_VECTOR
+    """Rotation vector that turns the body's own axes into those of its shape. In rad."""
     name: str = ""
+    """Name of a block that is not part of a ring."""
     type: str = ""
+    """Type of block that the study gives; empty if it gives none."""
     factor: float = 1.0
+    """Factor of the magnetization that the block got when, or after, it was mounted."""
     made_for: tuple[int, int] | None = None
+    """Ring and slot that the block was made for, if that is another place."""
 
     @property
     def position(self) -> Floats:
@@ -253,38 +226,25 @@ class VacuumNeighbour:
 
 @dataclass(frozen=True)
 class TrueMagnet:
-    """All sources of the field. In two dimensions lengths along z are infinite.
-
-    Attributes
-    ----------
-    dimension : int
-        2 or 3.
-    bodies : tuple of Body
-        The blocks, ring by ring and slot by slot.
-    iron : TrueIron, optional
-    background : tuple, in T
-        A uniform field that is added as it is: neither iron nor blocks respond to it.
-    copies : tuple of MagnetCopy
-        Neighbouring magnets.
-    objects : tuple of SoftSphere
-        Ferromagnetic objects in the surroundings.
-    neighbours : tuple of VacuumNeighbour
-        Neighbouring magnets in vacuum that the study knows of.
-    dipoles : tuple of pairs of tuples
-        Places in m and moments in A m^2 of distant magnetized objects.
-    losses : tuple of LostCell
-        What the blocks of a magnet in vacuum have lost.
-    """
+    """All sources of the field. In two dimensions lengths along z are infinite."""
 
     dimension: int
+    """2 or 3."""
     bodies: tuple[Body, ...]
+    """The blocks, ring by ring and slot by slot."""
     iron: TrueIron | None = None
     background: Vector = ZERO_VECTOR
+    """A uniform field that is added as it is: neither iron nor blocks respond to it. In T."""
     copies: tuple[MagnetCopy, ...] = ()
+    """Neighbouring magnets."""
     objects: tuple[SoftSphere, ...] = ()
+    """Ferromagnetic objects in the surroundings."""
     neighbours: tuple[VacuumNeighbour, ...] = ()
+    """Neighbouring magnets in vacuum that the study knows of."""
     dipoles: tuple[tuple[Vector, Vector], ...] = ()
+    """Places in m and moments in A m^2 of distant magnetized objects."""
     losses: tuple[LostCell, ...] = ()
+    """What the blocks of a magnet in vacuum have lost."""
 
     @property
     def all_bodies(self) -> tuple[Body, ...]:

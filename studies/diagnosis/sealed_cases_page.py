@@ -117,7 +117,6 @@ def page(
 
     Parameters
     ----------
-    study : Study
     results : sequence of mapping
         Result of each case, with the keys hidden, outside, named, unknown, chi2_before and
         chi2_after.

@@ -358,7 +358,7 @@ def test_a_study_of_keys_names_all_that_are_missing():
     (lambda: hf.export(hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04), "a.vtu", "vtu"),
      "format of hf.export must be left out for a magnet"),
     (lambda: hf.import_blocks("a.csv", fixed="sigma=1 %"), "fixed of hf.import_blocks"),
-    (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]], components=["x", "Bz"]), "out of x, y, z")])
+    (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]], components=["x", "Br"]), "out of x, y, z")])
 def test_mistakes_get_a_sentence(call, said):
     with pytest.raises(hf.HalbachError, match=said):
         call()
@@ -371,6 +371,26 @@ def test_a_masked_reading_is_none():
     assert np.isnan(data["B_T"].values).tolist() == [[False, True, False], [False] * 3]
     assert data["sigma_T"].values[0, 0] == 1e-5
     assert hf.Lines((0, 0, 0), (0, 0, 1), across=(0.01, [0.0, 0.02])).points.shape == (2, 201, 3)
+
+
+def test_names_of_components():
+    """Control: another unit, and a component named twice."""
+    for names in (["By", "Bx"], ["By_T", "Bx_T"], ["y", "x"], "yx"):
+        data = hf.field_map([[0, 0, 0]], [[0.2, 0.1]], components=names)
+        assert data["B_T"].values[0, :2].tolist() == [0.1, 0.2]
+    for wrong in (["By_mT", "Bx_mT"], ["Bx", "x"], ["Br", "Bz"]):
+        with pytest.raises(hf.HalbachError, match=", ".join(["components out of x", "y", "z"])):
+            hf.field_map([[0, 0, 0]], [[0.2, 0.1]], components=wrong)
+
+
+def test_noise_of_three_readings_or_of_three_components():
+    """Three numbers may be of either, and were taken as of components. The advice is followed."""
+    sigma = np.array([1e-5, 2e-5, 3e-5])
+    with pytest.raises(hf.HalbachError, match=r"sigma_T\[:, None\] for each reading"):
+        hf.field_map(np.eye(3), np.eye(3), sigma)
+    for one in (sigma[None, :], sigma[:, None], [1e-5] * 3):
+        expected = np.broadcast_to(one, (3, 3))
+        assert np.array_equal(hf.field_map(np.eye(3), np.eye(3), one)["sigma_T"], expected)
 
 
 def test_noise_of_each_reading_is_that_of_its_components():
@@ -533,6 +553,40 @@ def test_labels_are_read_as_names_of_columns(generator, labels):
             f"{one[0]}_mm" for one in "zyx"]):
         with pytest.raises(hf.HalbachError, match=r"axis labelled|m and T: z_mm"):
             read(wrong)
+
+
+@pytest.mark.parametrize("label", [
+    "z_nm", "z [\u00b5m]", "z (inches)", "Bz (Gauss)", "Bz [Oe]", "Bz_A/m", "Bz (kA/m)",
+    "Bz_\u00b5T", "Bz [mG]", "z [millimetre] "])
+def test_labels_that_state_another_unit(label):
+    """These were read as m and T. Control: names that end like units, and m and T themselves."""
+    points = np.arange(6.0).reshape(2, 3) / 100
+    for named in ("z_main", "Bz_long", "z_stage", "z (m)", "Bz [T]"):
+        names = [named.replace("z", axis, 1) for axis in "xyz"]
+        assert np.array_equal(
+            hf.field_map(points, pandas.DataFrame(points, columns=names))["B_T"], points)
+    with pytest.raises(hf.HalbachError, match="in other units than m and T"):
+        hf.field_map(points, pandas.DataFrame(points, columns=["x", "y", label]))
+
+
+def test_columns_in_a_dict(generator):
+    """So have structured arrays and Datasets them. Control: a dict without one of them."""
+    ring = hf.halbach_ring(**RING)
+    points = 0.01 * generator.uniform(-1, 1, (4, 3)) * [1, 1, 0]
+    columns = {name: points[:, "xyz".index(name)] for name in "zyx"}
+    rows = np.array([*zip(*columns.values(), strict=True)], [(name, float) for name in columns])
+    for one in (columns, columns | {"z": 0.0}, rows, rows.view(np.recarray), xr.Dataset({
+            f"{name}_m": ("point", values) for name, values in columns.items()})):
+        assert np.array_equal(ring.field_T(one), ring.field_T(points))
+        data = hf.field_map(one, one, {"y": 2e-5, "x": 1e-5, "z": 3e-5})
+        assert np.array_equal(data["B_T"], points)
+        assert data["sigma_T"].values[0].tolist() == [1e-5, 2e-5, 3e-5]
+    for wrong, said in (({"x": [0.0], "y": [0.0]}, "x, y, of which z"), ({}, "make a list"),
+                        ((row for row in points), "make a list"),
+                        ([{"x": 0.0, "y": 0.0, "z": 0.0}], "make a list"),
+                        ({"x_mm": [0.0], "y_mm": [0.0], "z_mm": [0.0]}, "other units")):
+        with pytest.raises(hf.HalbachError, match=said):
+            ring.field_T(wrong)
 
 
 def test_a_table_that_was_written_and_read(tmp_path):

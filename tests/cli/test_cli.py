@@ -526,26 +526,32 @@ def start():
             process.kill()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_interruption_ends_getdp_too(study, tmp_path, start, number):
-    out = tmp_path / "out"
-    marker = tmp_path / "pid"
-    fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
+def interrupted(start, number, folder, study, *program, waits_s=0.0):
+    """Interrupt a program that solves a study while GetDP runs; return the process of GetDP."""
+    marker = folder / "pid"
+    fake = fake_getdp(folder, f"echo $$ > {marker}; exec sleep 60")
     process = start(
-        [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(out), "--getdp",
+        [sys.executable, *program, "solve", str(study), "-o", str(folder / "out"), "--getdp",
          str(fake)], stderr=subprocess.PIPE, text=True,
         # a shell's background jobs ignore Ctrl-C, those of nohup SIGHUP: so would their children
         preexec_fn=lambda: signal.signal(number, signal.SIG_DFL))
     while not (marker.exists() and marker.read_text().strip()):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
+    time.sleep(waits_s)
     process.send_signal(number)
     _, said = process.communicate(timeout=50)  # GetDP itself would take 60
     assert process.returncode == 130
     assert said.strip().endswith("interrupted")
+    return int(marker.read_text())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interruption_ends_getdp_too(study, tmp_path, start, number):
+    getdp = interrupted(start, number, tmp_path, study, "-m", "halbach_fe")
     with pytest.raises(ProcessLookupError):
-        os.kill(int(marker.read_text()), 0)
-    assert not list(out.glob("field_map*"))
+        os.kill(getdp, 0)
+    assert not list((tmp_path / "out").glob("field_map*"))
 
 
 UNWOKEN = """
@@ -559,20 +565,8 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_an_interruption_that_wakes_nobody_ends_getdp_too(study, tmp_path, start):
-    marker = tmp_path / "pid"
-    fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
-    process = start(
-        [sys.executable, "-c", UNWOKEN, "solve", str(study), "-o", str(tmp_path / "out"),
-         "--getdp", str(fake)], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-    while not (marker.exists() and marker.read_text().strip()):
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.05)
-    time.sleep(1)  # the main thread waits for GetDP now
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=50)  # GetDP itself would take 60
-    assert process.returncode == 130
-    assert said.strip().endswith("interrupted")
+    """After a second the main thread waits for GetDP."""
+    interrupted(start, signal.SIGINT, tmp_path, study, "-c", UNWOKEN, waits_s=1.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])

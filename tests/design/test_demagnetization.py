@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.design import demagnetization
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
@@ -126,6 +126,24 @@ def test_a_flat_block(session):
     by_chance = replace(found, places=replace(found.places, along=pairs))
     assert by_chance.share_error == pytest.approx(
         8 * found.places.volumes.max() / found.places.volumes.sum())
+
+
+def test_a_field_from_outside_does_not_fall_with_the_remanence(session):
+    """In the middle of a long rod, whose own field is 0.1 % of the one outside, that alone is to
+    reach the knee: at 140.6 degrees. As if it fell like the remanence, that was 7 K higher.
+    """
+    knee_A_per_m = 0.9 * 1.6e6
+    rod = magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.2],
+        "size_y_m": [0.005], "size_z_m": [0.005], "remanence_T": [1.2]})
+    with pytest.warns(HalbachWarning, match="10000 times the earth's field"):
+        magnet = rod.with_(external={"background_T": [-0.5, 0.0, 0.0]}, demagnetization={
+            **COLD, "intrinsic_coercivity_A_per_m": 1.6e6, "squareness": 0.9,
+            "temperature_C": 20.0})
+    found = demagnetization_map(magnet, session, across=2)
+    limit = 20.0 + (1 - 0.5 / MU_0 / knee_A_per_m) / 6e-3
+    assert found.limit_temperature(0.5) == pytest.approx(limit, abs=0.5)
+    assert found.share_beyond(np.array([limit - 1, limit + 1])) == pytest.approx([0, 1], abs=0.3)
 
 
 @pytest.mark.parametrize("temperature", [74.0, 80.0])

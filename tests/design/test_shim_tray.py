@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -16,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from halbach_fe.cli import main
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
-from halbach_fe.design.shim_tray import EMPTY, _Search, shim_tray
+from halbach_fe.design.shim_tray import EMPTY, Filled, _Search, shim_tray
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map, write_map
@@ -56,7 +58,8 @@ def tray(**changes):
     return parse_study(DOCUMENT | {"shim_tray": DOCUMENT["shim_tray"] | changes})
 
 
-def cuboid(size, polarization, position, orientation):
+def cuboid(size: Sequence[float], polarization: Floats, position: Sequence[float] | Floats,
+           orientation: Rotation) -> magpylib.magnet.Cuboid:
     return magpylib.magnet.Cuboid(
         dimension=size, polarization=orientation.inv().apply(polarization), position=position,
         orientation=orientation)
@@ -75,7 +78,8 @@ def true_magnet(magnet, generator):
     return magpylib.Collection(*sources)
 
 
-def shims(filled, generator=None, turned_deg=0.0):
+def shims(filled: Sequence[Filled], generator: np.random.Generator | None = None,
+          turned_deg: float = 0.0) -> magpylib.Collection:
     """magpylib's magnets of a tray, perhaps of uncertain strength, or all turned."""
     sources, common = [], STRENGTH_SD * generator.standard_normal() if generator else 0.0
     for one in filled:

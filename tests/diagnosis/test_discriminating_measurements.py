@@ -40,6 +40,12 @@ from tests.conftest import DIPOLE, changed, circle
 
 EFFECTS = {effect.name: effect for effect in catalogue()}
 SIGMA = 5e-5
+OUTSIDE = {"external": {"background_T": [0.0, 0.0, 0.0]}, "uncertain": [
+    {"name": "outside", "sd": 1e-3, "change": {"external.background_T[2]": 1.0}}]}
+MORE = {"": {}, "variations": {"prior": {
+    "common_mode_sd": 0.001, "variation_sd": 0.02, "variation_length_m": 0.04}},
+    "outside": OUTSIDE}
+"""What a study has as parameters besides magnetizations."""
 POINTS = np.vstack([circle(0.06, 8, z) for z in np.linspace(-0.2, 0.2, 11)])
 
 
@@ -52,23 +58,23 @@ def session(getdp, tmp_path_factory):
 def inferred(session):
     """Update a short dipole in vacuum with its nominal map; once for each set of components."""
     @functools.cache
-    def make(components):
+    def make(components, more=""):
         study = parse_study(changed(
             DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,
             array__recoil_permeability=1.0, observation__components=list(components),
-            noise={"regions": [{"name": "all", "sigma_T": SIGMA}]},
-            prior={"common_mode_sd": 0.001}))
+            noise={"regions": [{"name": "all", "sigma_T": SIGMA}]}, **{
+                "prior": {"common_mode_sd": 0.001}} | MORE[more]))
         data = field_map(POINTS, field_of(build_magnet(study).blocks, POINTS))
         return infer(build_magnet(study), data,
-                     replace(session, folder=session.folder / components)), data
+                     replace(session, folder=session.folder / f"{components}{more}")), data
     return make
 
 
 @pytest.fixture
 def case(inferred):
     """Make a diagnosis in which a named effect has rivals; the map has no say in it."""
-    def make(named, values, *rivals, components="xyz", place=""):
-        update, data = inferred(components)
+    def make(named, values, *rivals, components="xyz", place="", more=""):
+        update, data = inferred(components, more)
         effect = EFFECTS[named]
         at = next(one for one in effect.places(update.study) if one.name == place)
         found = SelectedEffect(Candidate(named, place, (0,), effect.is_binary), 20.0, 16.0, tuple(
@@ -84,6 +90,17 @@ def case(inferred):
             loo_residuals_before=np.zeros(0),
             loo_residuals_after=np.zeros(0), rounds=1), data
     return make
+
+
+@pytest.mark.parametrize("more", ["variations", "outside"])
+def test_magnets_with_other_parameters(case, session, more):
+    """Variations inside blocks, and an uncertain field outside, which ended in an error. The latter
+    stays where it is if the magnet turns: an offset of By, which it hides, is none of the magnet.
+    """
+    diagnosis, data = case("offset_y", [2e-4], "background", more=more)
+    (found,) = separations(diagnosis, data, session)
+    assert found.recommended.name == "probe_rolled"
+    assert found.gains["magnet_turned"] < SEPARATING_GAIN
 
 
 @pytest.mark.parametrize(("named", "values", "rival", "components", "best", "also", "useless"), [

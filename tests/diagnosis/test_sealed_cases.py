@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 
 import numpy as np
 import pytest
 
 from halbach_fe.study.reader import read_study
-from tests.conftest import ROOT
+from tests.conftest import ROOT, module_of
 
-SCRIPT = ROOT / "studies" / "diagnosis" / "run.py"
+
 @pytest.fixture(scope="module")
 def study():
-    spec = importlib.util.spec_from_file_location("sealed_cases", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # for its dataclasses
-    sys.path.insert(0, str(SCRIPT.parent))  # as if it were run
-    spec.loader.exec_module(module)
-    sys.path.remove(str(SCRIPT.parent))
-    return module
+    return module_of("sealed_cases", ROOT / "studies" / "diagnosis" / "run.py")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import struct
 import tomllib
@@ -13,11 +12,9 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.study.free_blocks import COLUMNS, SIZES
 from halbach_fe.study.grades import grades
-from tests.conftest import ROOT
+from tests.conftest import ROOT, module_of
 
-spec = importlib.util.spec_from_file_location("gallery", ROOT / "docs" / "gallery.py")
-gallery = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(gallery)
+gallery = module_of("gallery", ROOT / "docs" / "gallery.py")
 PAGE = gallery.EXAMPLES.read_text(encoding="utf-8")
 FRAGMENTS = gallery.fragments(PAGE)
 

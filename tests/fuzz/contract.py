@@ -31,35 +31,24 @@ class BrokenError(AssertionError):
 
 @dataclass(frozen=True)
 class Reader:
-    """Something that opens a file.
-
-    Attributes
-    ----------
-    name : str
-    file : str
-        What the file is called, in a folder of its own.
-    seeds : tuple of bytes
-        Files as they should be, which are then damaged.
-    read : callable
-        Reads such a file.
-    refusal : type or None
-        The one error it may raise; None if it may raise none (a damaged store is as good as none).
-    valid : callable
-        Raises whatever it likes if what was read is not what it should be.
-    tokens : tuple of bytes
-        Pieces that mean something in such files.
-    made : callable or None
-        Makes files of its own from a random generator.
-    """
+    """Something that opens a file."""
 
     name: str
     file: str
+    """What the file is called, in a folder of its own."""
     seeds: tuple[bytes, ...]
+    """Files as they should be, which are then damaged."""
     read: Callable[[Path], Any]
+    """Reads such a file."""
     refusal: type[HalbachError] | None
+    """The one error it may raise; None if it may raise none (a damaged store is as good as
+    none)."""
     valid: Callable[[Any], object] = lambda read: None
+    """Raises whatever it likes if what was read is not what it should be."""
     tokens: tuple[bytes, ...] = ()
+    """Pieces that mean something in such files."""
     made: Callable[[Any], bytes] | None = None
+    """Makes files of its own from a random generator."""
 
 
 def refusal(reader: Reader, content: bytes, folder: Path) -> str:

@@ -45,6 +45,7 @@ from halbach_fe.stats.small_samples import (
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic import bodies
 from halbach_fe.synthetic.magpylib_field import vacuum_field
+from tests.oracles.cuboids import aharoni
 from tests.oracles.lone_block import moment_matrix
 
 VOLUME = np.pi * (0.1865**2 - 0.104**2) / 16 * 0.08
@@ -93,23 +94,6 @@ def vacuum_dipole(short_dipole):
 
 
 # --- conversion --------------------------------------------------------------------------------
-
-
-def aharoni(a, b, c):
-    """Magnetometric demagnetizing factor of a cuboid a x b x c along c: A. Aharoni, J. Appl. Phys.
-    83 (1998) 3432, equation 1, for full sides.
-    """
-    r, ab, ac, bc = np.sqrt([a * a + b * b + c * c, a * a + b * b, a * a + c * c, b * b + c * c])
-    log = np.log
-    return (
-        (b * b - c * c) / (2 * b * c) * log((r - a) / (r + a))
-        + (a * a - c * c) / (2 * a * c) * log((r - b) / (r + b))
-        + b / (2 * c) * log((ab + a) / (ab - a)) + a / (2 * c) * log((ab + b) / (ab - b))
-        + c / (2 * a) * log((bc - b) / (bc + b)) + c / (2 * b) * log((ac - a) / (ac + a))
-        + 2 * np.arctan(a * b / (c * r)) + (a**3 + b**3 - 2 * c**3) / (3 * a * b * c)
-        + (a * a + b * b - 2 * c * c) / (3 * a * b * c) * r + c / (a * b) * (ac + bc)
-        - (ab**3 + bc**3 + ac**3) / (3 * a * b * c)) / np.pi
-
 
 QUADRATURE = 1e-3
 """The tensor's Gauss quadrature is off by 6e-4 for these shapes (6 nodes; 12 leave 4e-5)."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-
 import numpy as np
 import pytest
 
@@ -13,22 +10,15 @@ from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_fiel
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.stats.small_samples import ranks, uniformity
 from halbach_fe.study.reader import read_study
-from tests.conftest import ROOT
+from tests.conftest import ROOT, module_of
 
-SCRIPT = ROOT / "studies" / "calibration" / "run.py"
 BLOCK_SIZE_M = 0.014
 """Coarser than the study's, but the model's error is still below the noise."""
 
 
 @pytest.fixture(scope="module")
 def calibration():
-    spec = importlib.util.spec_from_file_location("calibration_study", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # for its dataclasses
-    sys.path.insert(0, str(SCRIPT.parent))  # as if it were run
-    spec.loader.exec_module(module)
-    sys.path.remove(str(SCRIPT.parent))
-    return module
+    return module_of("calibration_study", ROOT / "studies" / "calibration" / "run.py")
 
 
 @pytest.fixture(scope="module")

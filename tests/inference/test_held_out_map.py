@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
 from halbach_fe.inference.readings import check_validation_map, read_campaign
+from halbach_fe.inference.result import HELD_OUT_MAP
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
+from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
+from tests.support.short_dipole import BODY, TEXT, reading, truth
 
 TRAINING = field_map(circle(0.07, 12), np.column_stack([
     np.linspace(0.1, 0.2, 12), np.zeros(12), np.full(12, np.nan)]))
@@ -102,3 +109,46 @@ def test_two_maps_at_the_same_points(dipole, generator):
     assert len(campaign(dipole, field_map(points_of(TRAINING), again))) == 2
     blank = np.where(np.arange(3) == 2, 0.01, np.nan) * np.ones((12, 1))
     assert len(campaign(dipole, field_map(points_of(TRAINING), blank))) == 2
+
+
+def test_a_held_out_map_has_the_uncertain_amplitudes_of_its_instrument(generator, session):
+    """As it has the terms of `instrument_sd`; without them its readings were 3 mT off, 200 bars."""
+    magnet_of, offset_T = truth(generator), 3e-3
+    maps = [reading(magnet_of, generator, points, (Rotation.identity(), np.zeros(3)))
+            for points in (BODY, BODY[::7] + np.array([1e-3, 2e-3, 3e-3]))]
+    for one in maps:
+        one["B_T"][:, 0] += offset_T
+    result = infer(build_magnet(parse_study(tomllib.loads(TEXT) | {"uncertain": [{
+        "name": "offset", "sd": offset_T, "change": {"instrument.offset_T[1]": 1.0}}]})),
+        maps[0], session, validation_map=maps[1])
+    (score,) = (one for one in result.scores if one.part == HELD_OUT_MAP)
+    assert score.chi2_posterior == pytest.approx(1, abs=5 * np.sqrt(2 / score.readings))
+    assert result.disagreement == ""
+
+
+def test_what_the_probe_of_a_held_out_map_cannot_have(generator, session):
+    """|B| has no offset of one component, and is predicted without it."""
+    magnet_of = truth(generator)
+    data = reading(magnet_of, generator, BODY, (Rotation.identity(), np.zeros(3)))
+    points = BODY[::7] + np.array([1e-3, 2e-3, 3e-3])
+    total = np.linalg.norm(magnet_of.getB(points), axis=1)
+    total += 2e-5 * generator.standard_normal(len(total))
+    result = infer(build_magnet(parse_study(tomllib.loads(TEXT) | {"uncertain": [{
+        "name": "offset", "sd": 3e-3, "change": {"instrument.offset_T[1]": 1.0}}]})),
+        data, session, validation_map=total_field_map(points, total))
+    (score,) = (one for one in result.scores if one.part == HELD_OUT_MAP)
+    assert score.chi2_posterior == pytest.approx(1, abs=5 * np.sqrt(2 / score.readings))
+
+
+@pytest.mark.parametrize("length_unit_m", [1.0, 1e-3])
+def test_circles_of_a_map_in_its_own_unit(dipole, length_unit_m):
+    """Fourier coefficients are observed of a held-out map whose points are on the study's circles
+    once they are in m; one in mm was taken for a map of flux densities, and its noise asked for.
+    """
+    study = dipole(noise=NOISE, instrument={"length_unit_m": length_unit_m}, observation={
+        "quantity": "fourier_coefficients", "harmonics": 3, "positions": {
+            "kind": "circles", "radius_m": 0.07, "angles": 12}})
+    field = np.column_stack([np.linspace(0.1, 0.2, 12), np.zeros(12), np.zeros(12)])
+    points = circle(0.07, 12) / length_unit_m
+    maps = maps_of(study, field_map(points, field), field_map(points, 1.1 * field))
+    assert [one.study.observation.quantity for one in maps] == 2 * ["fourier_coefficients"]

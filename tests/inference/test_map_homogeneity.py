@@ -262,10 +262,13 @@ def test_a_gain_that_is_not_known_is_in_the_mean(generator, tmp_path, errors):
     sampling = region_points(build_magnet(study()), REGION)
     points, weights = sampling.points, sampling.weights
     mean = float(weights @ np.linalg.norm(true_field(1, points, errors=errors), axis=1))
-    magnets = (build_magnet(study().with_(instrument_sd=sd, inference={}))
-               for sd in ({"gain": 0.02}, {}))
-    known, exact = (homogeneity(magnet, Session.open(tmp_path), REGION, data=strong).of_map[MAP]
-                    for magnet in magnets)
+    amplitude = {"name": "gain", "sd": 0.02, "change": {
+        f"instrument.gain[{axis}]": 1.0 for axis in (1, 2, 3)}}
+    magnets = (build_magnet(study().with_(inference={}, **open_)) for open_ in (
+        {"instrument_sd": {"gain": 0.02}}, {"uncertain": [amplitude]}, {}))
+    known, together, exact = (homogeneity(
+        magnet, Session.open(tmp_path), REGION, data=strong).of_map[MAP] for magnet in magnets)
+    assert together.mean_sd_T == pytest.approx(0.02 * together.mean_T, rel=0.1)
     assert known.mean_T == pytest.approx(mean, abs=3 * known.mean_sd_T)
     # Maxwell's equations tie the three gains to each other, which leaves their mean
     assert known.mean_sd_T == pytest.approx(0.02 / np.sqrt(3) * known.mean_T, rel=0.1)

@@ -93,6 +93,21 @@ def test_a_part_of_a_map_in_another_one(generator):
         maps_of(study("one", "two"), {**data, "two": field_map(GRID, second)})
 
 
+def test_a_copy_with_another_zero(generator):
+    """An offset of half its noise made a copy count twice. Control: a map that was read again, with
+    the same offset; its rows differ by the noise of both.
+    """
+    first, offset = read(generator), np.array([5e-6, -3e-6, 0.0])
+    again = read(generator) + offset
+    maps_of(study("one", "two"), {"one": field_map(GRID, first), "two": field_map(GRID, again)})
+    for copy in (first + offset, first[::-1][:400] + offset):
+        places = GRID if len(copy) == len(GRID) else GRID[::-1][:400]
+        with pytest.raises(MeasurementError, match=f"in {len(copy)} of {len(copy)} rows, but for "
+                           "an offset of 5\u00a0\u00b5T"):
+            maps_of(study("one", "two"), {
+                "one": field_map(GRID, first), "two": field_map(places, copy)})
+
+
 def test_a_field_along_z_in_two_dimensions_is_told(generator):
     """A 2D study has no Bz: 0.3 T of it were left out without a word."""
     flat = tomllib.loads(STUDY)

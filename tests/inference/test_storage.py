@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -36,6 +38,14 @@ def inferred(dipole, session):
     return update, session.folder / "posterior.h5"
 
 
+def measured_again(update, path, generator):
+    """Return the update by readings with their noise, which agrees with them, and its path."""
+    field = field_of(update.magnet.blocks, circle(0.07, 24))
+    field += NOISE["regions"][0]["sigma_T"] * generator.standard_normal(field.shape)
+    field[:, 2] = np.nan
+    return infer(update.magnet, field_map(circle(0.07, 24), field), NOT_KEPT), path
+
+
 def test_posterior_of_the_same_magnet(inferred):
     """Whatever else differs, such as the mesh or what is measured."""
     update, path = inferred
@@ -54,17 +64,36 @@ def test_posterior_of_the_same_magnet(inferred):
     ({"mesh__block_size_m": 0.01, "prior__types": {"a": [*range(1, 17)]}, "name": "other"}, None)])
 def test_posterior_of_another_version_of_the_study_says_so(inferred, generator, changes, key):
     """What was inferred of another place of the map, say, is no update of this study."""
-    update, path = inferred
-    field = field_of(update.magnet.blocks, circle(0.07, 24))
-    field += NOISE["regions"][0]["sigma_T"] * generator.standard_normal(field.shape)
-    field[:, 2] = np.nan
-    update = infer(update.magnet, field_map(circle(0.07, 24), field), NOT_KEPT)
+    update, path = measured_again(*inferred, generator)
     write_inference(update, path.parent)
     magnet = build_magnet(update.study.with_(**changes))
     for said in (read_posterior(magnet, path).disagreement, disagreement_of(update, magnet)):
         assert isinstance(said, Reservation)
         assert said == ("" if key is None else (
             f"Only of another version of the study, with another `{key}`."))
+
+
+@pytest.mark.parametrize(("shift_sd_m", "changes", "key"), [
+    (0.0, {"file": "elsewhere/b.csv"}, None),
+    (0.0, {"instrument": {"translation_m": (0.0, 0.0, 1e-3)}}, "maps"),
+    (5e-3, {"file": "elsewhere/b.csv"}, None),
+    (5e-3, {"instrument": {"translation_m": (0.0, 0.0, 1e-3)}}, None)])
+def test_versions_of_a_study_that_lists_maps(inferred, generator, shift_sd_m, changes, key):
+    """Where its files are makes no difference, nor where a map lies if the update estimated its
+    shift along the stage: a study with what was found is the same one.
+    """
+    update, _ = measured_again(*inferred, generator)
+
+    def magnet(**own):
+        maps = [{"name": name, "file": f"{name}.csv", "stage": "table"} for name in "ab"]
+        maps[1] |= {"stage_shift_sd_m": (0.0, 0.0, shift_sd_m)} | own
+        return build_magnet(update.study.with_(maps=maps))
+
+    of_maps = replace(update, magnet=magnet())
+    said = disagreement_of(of_maps, magnet(**changes))
+    assert said.startswith("" if key is None else (
+        f"Only of another version of the study, with another `{key}"))
+    assert bool(said) == bool(key)
 
 
 @pytest.mark.parametrize(("changes", "key"), [

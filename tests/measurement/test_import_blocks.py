@@ -8,12 +8,14 @@ import zipfile
 import numpy as np
 import pytest
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
+from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.free_blocks_file import read_free_blocks
 
 MU_0 = 4e-7 * np.pi
@@ -288,6 +290,30 @@ def test_units_below_the_names(tmp_path):
             ("[A m^2]", units.format("A m^2").replace("C", "K"), "temperature")):
         with pytest.raises(MeasurementError, match=rf"unit of {name} .* in the line of units"):
             imported(tmp_path, MEASURED.format(header, ",temp[C]", below, "25"))
+
+
+def test_a_table_of_free_blocks_is_imported_whole(tmp_path):
+    """As `halbach-fe export` writes it: its permeabilities were said to be none of free blocks, and
+    for the semicolons of its outlines it had no header. Control: an outline that is none.
+    """
+    columns = {"name": ["cube", "prism"], "type": ["a", "b"], "shape": ["cuboid", "prism"],
+               "ring": [1, 1], "slot": [1, 2], "x_m": [0.04, -0.04], "y_m": [0.0] * 2,
+               "z_m": [0.0] * 2, "size_x_m": [0.02, None], "size_y_m": [0.02, None],
+               "size_z_m": [0.02, 0.01], "outline_m": [
+                   None, ((0.0, 0.0), (0.02, 0.0), (0.02, 0.01), (0.0, 0.0125))],
+               "remanence_x_T": [1.3, 1.1], "remanence_y_T": [0.0] * 2, "remanence_z_T": [0.0] * 2,
+               "recoil_permeability": [1.05, 1.2], "recoil_permeability_across": [1.1, None],
+               "magnetization_gradient": [0.01, None], "inner_corner_loss": [0.1, None]}
+    magnet = hf.magnet_of_blocks(columns)
+    path = hf.export(magnet, tmp_path / "blocks.csv")
+    text = path.read_text()
+    assert imported(tmp_path, text) == FreeBlocks(**read_free_blocks(path))
+    in_mm = text.replace("outline_m", "outline [mm]").replace(
+        "0.0 0.0; 0.02 0.0; 0.02 0.01; 0.0 0.0125", "0 0; 20 0; 20 10; 0 12.5")
+    assert in_mm.count("12.5") == 1
+    assert imported(tmp_path, in_mm) == FreeBlocks(**read_free_blocks(path))
+    with pytest.raises(MeasurementError, match=r"outline in line 3 .*corners as"):
+        imported(tmp_path, in_mm.replace("0 12.5", "12.5"))
 
 
 def test_columns_that_are_not_read_are_named(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import (
@@ -17,6 +18,8 @@ from halbach_fe.measurement.observation import (
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.synthetic.faulty_instrument import stated_places
+from halbach_fe.synthetic.simulate import real_places
 from tests.conftest import changed, circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
@@ -203,6 +206,30 @@ def test_noise_of_positions(short_dipole, displaced, generator, quantity, from_m
         "position_sd_m": POSITION_SD[-1:] + POSITION_SD[:-1]}})
     other = reading_noise(build_magnet(turned), observation, data).covariance.toarray()
     assert np.abs(other / scale - covariance).max() > 0.3
+
+
+def test_positions_scatter_along_the_axes_of_the_stage(short_dipole, generator):
+    """Of a stage that is turned by 80 degrees in the magnet, by the simulator's law of places, as
+    above. Noise along the axes of the magnet is the control: it was that.
+    """
+    study = short_dipole(
+        instrument={"rotation_rad": [0.0, 1.4, 0.0]},
+        noise={"regions": [{"name": "all", "sigma_T": 1e-6}], "position_sd_m": POSITION_SD})
+    magnet = build_magnet(study)
+    turn = rotation_matrix(study.instrument.rotation_rad)
+    stated = circle(0.075, 12, 0.07) @ turn  # in the coordinates of the stage
+    noise, along_magnet = (reading_noise(each, observe(
+        each.study, points, np.ones((12, 3), bool)), field_map(points, np.ones((12, 3))))
+        for each, points in ((magnet, stated), (magnet.with_(instrument={}), stated @ turn.T)))
+    draws = []
+    for _ in range(1500):
+        places = stated_places(study.instrument, real_places(study, stated, generator))
+        draws.append((field_of(magnet.blocks, places[0]) @ turn).ravel())
+    covariance, scale = np.cov(np.array(draws).T), np.outer(noise.sd, noise.sd)
+    np.testing.assert_allclose(noise.covariance.toarray() / scale, covariance / scale, atol=0.185)
+    turned = np.kron(np.eye(12), turn.T)
+    other = turned @ along_magnet.covariance.toarray() @ turned.T
+    assert np.abs((other - covariance) / scale).max() > 0.5
 
 
 def test_one_value_for_all_axes(short_dipole):

@@ -54,3 +54,18 @@ def cuboid_field(document: dict[str, Any], magnetization: Floats, points: Floats
                 places, np.tile(size, (len(places), 1)), np.tile(own, (count, 1)))
             total[first:first + count] += field.reshape(count, len(z), 3).sum(axis=1) @ turn.T
     return total
+
+
+def aharoni(a, b, c):
+    """Demagnetizing factor along c of a cuboid: A. Aharoni, J. Appl. Phys. 83 (1998) 3432."""
+    ab, ac, bc = np.hypot(a, b), np.hypot(a, c), np.hypot(b, c)
+    r = np.sqrt(a * a + b * b + c * c)
+    return ((b * b - c * c) / (2 * b * c) * np.log((r - a) / (r + a))
+            + (a * a - c * c) / (2 * a * c) * np.log((r - b) / (r + b))
+            + b / (2 * c) * np.log((ab + a) / (ab - a))
+            + a / (2 * c) * np.log((ab + b) / (ab - b))
+            + c / (2 * a) * np.log((bc - b) / (bc + b))
+            + c / (2 * b) * np.log((ac - a) / (ac + a)) + 2 * np.arctan(a * b / (c * r))
+            + (a**3 + b**3 - 2 * c**3) / (3 * a * b * c)
+            + (a * a + b * b - 2 * c * c) / (3 * a * b * c) * r + c / (a * b) * (ac + bc)
+            - (ab**3 + bc**3 + ac**3) / (3 * a * b * c)) / np.pi

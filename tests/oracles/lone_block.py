@@ -23,7 +23,6 @@ def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: i
 
     Parameters
     ----------
-    shape : Shape
     permeability : ndarray, shape (3, 3)
         Relative recoil permeability in the shape's axes, as is the matrix.
     mesh : ngsolve.Mesh, optional

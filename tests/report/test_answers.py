@@ -901,6 +901,50 @@ def test_an_update_without_circles_states_its_strongest_reading(given):
         given.updated, [(model, magnets)]).said
 
 
+def undulator(**axial):
+    """Return two periods of blocks above and below the beam, whose polarization turns along z."""
+    turn = np.pi / 2 * np.arange(8)
+    rows = [(0.0, sign * 0.02, 0.01 * n - 0.035, np.cos(angle), sign * np.sin(angle))
+            for sign in (-1, 1) for n, angle in enumerate(turn)]
+    columns = dict(zip(("x_m", "y_m", "z_m", "remanence_y_T", "remanence_z_T"),
+                       np.transpose(rows).round(12).tolist(), strict=True))
+    count = len(rows)
+    return hf.magnet_of_blocks(columns | {"shape": ["cuboid"] * count, "size_x_m": [0.04] * count,
+        "size_y_m": [0.02] * count, "size_z_m": [0.01] * count, "remanence_x_T": [0.0] * count}
+        | {name: [value] * count for name, value in axial.items()})
+
+
+def test_an_undulator_is_sent_to_its_axis(tmp_path, monkeypatch):
+    """Both were sent to `homogeneity`, of a field that has no mean; the command runs. Controls: a
+    dipole, axial magnets with a field along z, a single block, and a region that the study names.
+    """
+    monkeypatch.chdir(tmp_path)
+    magnet = undulator()
+    hf.write_study(magnet, "study.toml")
+    points = [[x, y, z] for x in (-2e-3, 2e-3) for y in (-2e-3, 2e-3)
+              for z in np.linspace(-0.04, 0.04, 21)]
+    noise = 1e-5 * np.random.default_rng(1).standard_normal((len(points), 3))
+    found = hf.infer(magnet, points, magnet.field_T(points) + noise, sigma_T=1e-5)
+    hf.write_report(found, "inferred")
+    for said, measured in ((solution.answer(hf.solve(magnet, Session.temporary())), False),
+                           (inference_answer.answer(found), True)):
+        assert "an undulator has no mean field" in said.step
+        words = said.command.replace("STUDY", "study.toml").replace(
+            "DIR/posterior.h5", "inferred/posterior.h5").replace("DIR", f"axis-{measured}").split()
+        assert main([*words[1:], "--json"]) == 0
+        assert ("--posterior" in words) == measured
+    regional = replace(found, magnet=magnet.with_(homogeneity={"sphere_m": 0.002}))
+    assert "homogeneity STUDY" in inference_answer.answer(regional).command
+    dipole = hf.halbach_ring(order=1, blocks=8, inner_radius_m=0.02, outer_radius_m=0.03,
+                             length_m=0.05)
+    axial = undulator(remanence_y_T=0.0, remanence_z_T=1.2)
+    single = hf.magnet_of_blocks({name: [value] for name, value in {
+        "shape": "cuboid", "x_m": 0.04, "y_m": 0.0, "z_m": 0.0, "size_x_m": 0.02,
+        "size_y_m": 0.02, "size_z_m": 0.02, "remanence_T": 1.3}.items()})
+    assert [one.cancels_along_z for one in (magnet, dipole, axial, single)] == [
+        True, False, False, False]
+
+
 def test_an_order_that_hardly_matters(given):
     """The one that was found is as good as the table's; the control of more gain is above."""
     magnet = build_magnet(given.study.with_(array__rings=2))

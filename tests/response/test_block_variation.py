@@ -8,11 +8,13 @@ import magpylib
 import numpy as np
 import pytest
 
+import halbach_fe as hf
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.response.block_variation import Variations
+from halbach_fe.response.block_variation import Variations, neighbour_deviations
+from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 
@@ -131,3 +133,19 @@ def test_incomplete_keys_are_refused():
                                   "relative_permeability": 100.0}}):
         with pytest.raises(StudyError, match="variation"):
             parse_study(study | change)
+
+
+@pytest.mark.parametrize("permeability", [1.0, 1.1])
+def test_neighbours_deviate_as_their_field_does(permeability):
+    """A strength that all blocks of a neighbour share changes its field by as much of it, whatever
+    the recoil permeability of the blocks; by that factor it was too small.
+    """
+    magnet = hf.halbach_ring(
+        blocks=8, inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.06, remanence_T=1.2)
+    magnet = magnet.with_(
+        array__recoil_permeability=permeability, external={"neighbours": [{"z_m": 0.1}]},
+        prior={"magnitude_sd": 1e-9, "direction_sd_deg": 1e-9, "common_mode_sd": 0.01})
+    points = np.array([[0.0, 0.0, 0.03], [0.005, 0.0, 0.02]])
+    sd = np.linalg.norm(neighbour_deviations(magnet, points), axis=0)
+    np.testing.assert_allclose(sd, 0.01 * np.abs(external_field(magnet, points)), rtol=1e-6,
+                               atol=1e-10)  # of the blocks by themselves: 2e-11

@@ -121,21 +121,41 @@ def test_unknown_setnumber(getdp, staged):
         run(getdp, dataclasses.replace(job, numbers={"VACUM": 1}), folder)
 
 
-def test_missing_boundary_condition(getdp, staged):
+@pytest.mark.parametrize(("file", "old", "new", "said"), [
+    ("magnetostatics_2d.pro",
+     "{ NameOfCoef an; EntityType NodesOf; NameOfConstraint MagneticInsulation; }", "",
+     r"unknowns where the mesh gives .*boundary condition"),
+    # a region that the problem forgets leaves a system of the wrong size
+    ("problem_data.pro", "Vol_All = Region[ {Vol_Air, Vol_Iron, Vol_Mag} ]",
+     "Vol_All = Region[ {Vol_Iron, Vol_Mag} ]", "a region is missing"),
+    # GetDP only warns when IterativeLoop gives up
+    ("solve_sources.pro", "Generate[A]; Solve[A]; PostOperation[FluxDensity];",
+     """InitSolution[A];
+      IterativeLoop[1, 1e-30, 1]{ GenerateJac[A]; SolveJac[A]; }
+      PostOperation[FluxDensity];""", "an iteration did not converge"),
+    ("solve_sources.pro", "Evaluate[ $source = FIRST_SOURCE, $sample = 0 ];", "",
+     r"run-time variable was never set"),
+    ("sources.pro", "Function {", "Function { Exit;", "syntax error"),
+], ids=["boundary condition", "region", "iteration", "run-time variable", "syntax"])
+def test_an_edited_problem_is_refused(getdp, staged, file, old, new, said):
     folder, job = staged
-    edit(folder / job.problem,
-         "{ NameOfCoef an; EntityType NodesOf; NameOfConstraint MagneticInsulation; }", "")
-    with pytest.raises(GetDPError, match=r"unknowns where the mesh gives .*boundary condition"):
+    edit(folder / file, old, new)
+    with pytest.raises(GetDPError, match=said):
         run(getdp, job, folder)
 
 
-def test_region_missing_from_the_problem(getdp, staged):
-    """A region that the problem forgets leaves a system of the wrong size."""
+def test_unconverged_krylov_solver(getdp, staged):
     folder, job = staged
-    edit(folder / "problem_data.pro", "Vol_All = Region[ {Vol_Air, Vol_Iron, Vol_Mag} ]",
-         "Vol_All = Region[ {Vol_Iron, Vol_Mag} ]")
-    with pytest.raises(GetDPError, match="a region is missing"):
-        run(getdp, job, folder)
+    options = ("-petsc_prealloc", "100", "-ksp_type", "cg", "-pc_type", "none", "-ksp_max_it", "3")
+    with pytest.raises(GetDPError, match="linear solver did not converge"):
+        run(getdp, dataclasses.replace(job, options=options), folder)
+
+
+def test_mumps_out_of_memory(getdp, staged):
+    folder, job = staged
+    options = (*job.options, "-mat_mumps_icntl_14", "-99", "-mat_mumps_icntl_23", "1")
+    with pytest.raises(GetDPError, match=r"MUMPS|did not converge"):
+        run(getdp, dataclasses.replace(job, options=options), folder)
 
 
 def test_missing_gauge(getdp, short_dipole, tmp_path):
@@ -151,13 +171,6 @@ def test_missing_gauge(getdp, short_dipole, tmp_path):
         run(getdp, job, folder)
 
 
-def test_unconverged_krylov_solver(getdp, staged):
-    folder, job = staged
-    options = ("-petsc_prealloc", "100", "-ksp_type", "cg", "-pc_type", "none", "-ksp_max_it", "3")
-    with pytest.raises(GetDPError, match="linear solver did not converge"):
-        run(getdp, dataclasses.replace(job, options=options), folder)
-
-
 def test_residual_that_stays_large_is_caught_without_petscs_help(tmp_path):
     job_log = ["Info : System 1/1: 10 Dofs", "  0 KSP Residual norm 1e5",
                "  1 KSP Residual norm 1e-7"]
@@ -170,37 +183,12 @@ def test_residual_that_stays_large_is_caught_without_petscs_help(tmp_path):
             _check_log([*job_log[:2], f"  1 KSP Residual norm {bad}"], job, tmp_path)
 
 
-def test_unconverged_iteration(getdp, staged):
-    """GetDP only warns when IterativeLoop gives up."""
-    folder, job = staged
-    edit(folder / "solve_sources.pro", "Generate[A]; Solve[A]; PostOperation[FluxDensity];",
-         """InitSolution[A];
-      IterativeLoop[1, 1e-30, 1]{ GenerateJac[A]; SolveJac[A]; }
-      PostOperation[FluxDensity];""")
-    with pytest.raises(GetDPError, match="an iteration did not converge"):
-        run(getdp, job, folder)
-
-
-def test_mumps_out_of_memory(getdp, staged):
-    folder, job = staged
-    options = (*job.options, "-mat_mumps_icntl_14", "-99", "-mat_mumps_icntl_23", "1")
-    with pytest.raises(GetDPError, match=r"MUMPS|did not converge"):
-        run(getdp, dataclasses.replace(job, options=options), folder)
-
-
 def test_stale_output(getdp, staged):
     """An output of an earlier run is no output of this one."""
     folder, job = staged
     run(getdp, job, folder)
     edit(folder / "solve_sources.pro", "PostOperation[FluxDensity];", "")
     with pytest.raises(GetDPError, match=r"did not write flux_density\.txt"):
-        run(getdp, job, folder)
-
-
-def test_unset_run_time_variable(getdp, staged):
-    folder, job = staged
-    edit(folder / "solve_sources.pro", "Evaluate[ $source = FIRST_SOURCE, $sample = 0 ];", "")
-    with pytest.raises(GetDPError, match=r"run-time variable was never set"):
         run(getdp, job, folder)
 
 
@@ -265,13 +253,6 @@ def test_missing_files_are_named(getdp, staged):
     folder, job = staged
     (folder / job.mesh).unlink()
     with pytest.raises(GetDPError, match=r"mesh\.msh is missing"):
-        run(getdp, job, folder)
-
-
-def test_syntax_error_is_quoted(getdp, staged):
-    folder, job = staged
-    edit(folder / "sources.pro", "Function {", "Function { Exit;")
-    with pytest.raises(GetDPError, match="syntax error"):
         run(getdp, job, folder)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import halbach_fe as hf
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.measurement_plan import (
     greedy,
@@ -42,6 +43,43 @@ def test_running_gain_is_that_of_the_chosen(generator):
     assert len(set(chosen)) == 12
     for count in (1, 5, 12):
         assert gain[count - 1] == pytest.approx(information(np.vstack(design[chosen[:count]])))
+
+
+def test_information_about_what_is_beside_does_not_count(generator):
+    """The gain is the mutual information of the readings with the first five parameters alone."""
+    design = generator.standard_normal((30, 2, 8))
+    choice = greedy(design, 12, beside=design[:, :, 5:])
+    for count in (1, 5, 12):
+        rows = np.vstack(design[choice.chosen[:count]])
+        noise = np.eye(len(rows)) + rows[:, 5:] @ rows[:, 5:].T
+        whole = noise + rows[:, :5] @ rows[:, :5].T
+        assert choice.gain[count - 1] == pytest.approx(
+            (np.linalg.slogdet(whole)[1] - np.linalg.slogdet(noise)[1]) / 2)
+
+
+@pytest.mark.parametrize("open_", [
+    {}, {"instrument_sd": {"gain": 0.02}},
+    {"instrument_sd": {"translation_m": 1e-3, "rotation_rad": 0.01}},
+    {"uncertain": [{"name": "gain", "sd": 0.02, "change": {
+        f"instrument.gain[{axis}]": 1.0 for axis in (1, 2, 3)}}]},
+    {"external": {"neighbours": [{"z_m": 0.08}]}}],
+    ids=["exact", "gain", "pose", "uncertain", "neighbour"])
+def test_a_plan_knows_the_blocks_as_an_update_will(open_):
+    """Standard deviations are those of an update at the same positions, by all that the study
+    leaves open: with a gain of 2 % they were 2.3 times too short. The update is about the readings,
+    which changes the derivatives by the pose by a per cent.
+    """
+    magnet = hf.halbach_ring(
+        blocks=8, inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.06, remanence_T=1.2).with_(
+            noise={"regions": [{"name": "all", "sigma_T": 1e-5}]}, inference={}, observation={
+                "quantity": "flux_density", "positions": {
+                    "kind": "grid", "start_m": [-0.01, -0.01, -0.03], "end_m": [0.01, 0.01, 0.03],
+                    "count": [3, 3, 5]}}, **open_)
+    points = points_from(magnet.study.observation.positions)
+    planned = hf.plan(magnet, points=len(points))
+    update = hf.infer(magnet, hf.field_map(points, magnet.field_T(points)))
+    np.testing.assert_allclose(planned.baseline_sd, update.posterior.sd, rtol=0.03)
+    assert planned.gain[-1] == pytest.approx(planned.baseline_gain[-1], rel=1e-6)
 
 
 def test_greedy_is_near_the_best(generator):
@@ -89,7 +127,8 @@ def test_plan_in_a_cross_section(dipole, session):
     assert len(same.points) == 12
     own = same.baseline_gain[list(same.baseline_counts).index(12)]
     assert own < same.gain[11] * 1.02
-    assert same.volume_ratio == pytest.approx(1, abs=0.05)  # measured: 0.99
+    # measured: 0.94, and 0.99 without the error of the mesh, which all readings share
+    assert same.volume_ratio == pytest.approx(1, abs=0.08)
 
     wider = plan_measurement(build_magnet(dipole(noise=NOISE, observation__components=["x", "y"],
                         plan={"candidates": circles(0.05, 0.09), "points": 24})), session)

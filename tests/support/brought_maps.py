@@ -35,34 +35,24 @@ WEAK = 0.03
 
 @dataclass(frozen=True)
 class Brought:
-    """A map that a new user brings.
-
-    Attributes
-    ----------
-    new : str
-        Options of ``halbach-fe new``.
-    reach_m : tuple of float
-        Largest distance of a point from the axis, and from z = 0; of a sphere from the middle.
-    units : tuple of float
-        Units in a metre and in a tesla of the file.
-    assumed, true : float
-        Recoil permeability in the study, and of the blocks.
-    shift_m, turn_deg : tuple of float
-        Where the zero of the mapper lies in the magnet, and the rotation vector of its axes.
-    seed, steps : int
-        Of the random numbers, and how many points the grid has along x and y.
-    """
+    """A map that a new user brings."""
 
     name: str
     new: str
+    """Options of ``halbach-fe new``."""
     reach_m: tuple[float, float]
+    """Largest distance of a point from the axis, and from z = 0; of a sphere from the middle."""
     units: tuple[float, float] = (1.0, 1.0)
+    """Units in a metre and in a tesla of the file."""
     assumed: float = 1.0
     true: float = 1.0
+    """Recoil permeability in the study, and of the blocks."""
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the zero of the mapper lies in the magnet, and the rotation vector of its axes."""
     seed: int = 1
     steps: int = 7
+    """Of the random numbers, and how many points the grid has along x and y."""
 
 
 def bring(case: Brought, folder: Path) -> None:

@@ -25,21 +25,14 @@ ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}
 
 @dataclass(frozen=True)
 class Killed:
-    """What a kill and another run of the same command came to.
-
-    Attributes
-    ----------
-    hit : bool
-        Whether the command was still running.
-    resumed_s : float
-        What the other run took.
-    broken : list of str
-        What was wrong after the kill or after the other run.
-    """
+    """What a kill and another run of the same command came to."""
 
     hit: bool
+    """Whether the command was still running."""
     resumed_s: float
+    """What the other run took."""
     broken: list[str]
+    """What was wrong after the kill or after the other run."""
 
 
 def command(verb: str, study: Path, campaign: Path, output: Path) -> list[str]:

@@ -16,16 +16,11 @@ class Weighed:
 
     A process that is started counts what its starter has as its own, which here would be this
     program's, and more than many a GetDP's; so a small one stands in between.
-
-    Attributes
-    ----------
-    getdp : GetDP
-    record : Path
-        A line of KiB for every run.
     """
 
     getdp: GetDP
     record: Path
+    """A line of KiB for every run."""
 
     @classmethod
     def of(cls, getdp: GetDP, folder: Path) -> Weighed:

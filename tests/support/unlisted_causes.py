@@ -49,30 +49,20 @@ FieldAt = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class UnlistedCause:
-    """What was drawn, in words and numbers.
-
-    Attributes
-    ----------
-    acts_on : str
-        ``positions``, ``readings`` or ``source``.
-    varies_along : str
-        The coordinate of the random function, or which source it is.
-    texture : str
-        ``smooth`` or ``rough``; fields of sources are smooth.
-    axes : tuple of int
-        Components of the position, or sensors, that are off.
-    rms_T : float
-        Rms change of the readings without noise that it causes, over all components.
-    rms_over_noise : float
-        The same for the whitened readings.
-    """
+    """What was drawn, in words and numbers."""
 
     acts_on: str
+    """``positions``, ``readings`` or ``source``."""
     varies_along: str
+    """The coordinate of the random function, or which source it is."""
     texture: str
+    """``smooth`` or ``rough``; fields of sources are smooth."""
     axes: tuple[int, ...]
+    """Components of the position, or sensors, that are off."""
     rms_T: float
+    """Rms change of the readings without noise that it causes, over all components."""
     rms_over_noise: float
+    """The same for the whitened readings."""
 
     @property
     def family(self) -> str:
@@ -93,12 +83,7 @@ def simulate_unlisted(
     The field is magpylib's, as in `halbach_fe.synthetic.simulate`. The order in which the points
     were measured is drawn, too: circle by circle along z, or line by line.
 
-    Parameters
-    ----------
-    study : Study
-    seed : int
-    family : tuple, optional
-        One of `families`; drawn if left out.
+    ``family``: one of `families`; drawn if left out.
     """
     # Displacement by which the change of the readings per displacement is found.
     trial_displacement_m = 1e-4

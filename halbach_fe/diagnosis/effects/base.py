@@ -205,7 +205,6 @@ class Effect(ABC):
 
         Parameters
         ----------
-        study : Study
         mean : ndarray, shape (m,), in A/m
             Prior mean of the magnetizations.
         information, score : ndarray, shape (m, m) and (m,)

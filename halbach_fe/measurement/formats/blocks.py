@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -37,9 +37,10 @@ from halbach_fe.measurement.formats.text import (
     text_of_table,
     uncommented,
 )
+from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
 from halbach_fe.study.free_blocks import SIZES, FreeBlocks
-from halbach_fe.study.free_blocks_file import validated_blocks
+from halbach_fe.study.free_blocks_file import outline_of, validated_blocks
 from halbach_fe.study.types import COMPONENTS
 
 TEXTS = ("serial", "type", "ring", "slot", "shape", "material")
@@ -77,7 +78,10 @@ TURN = re.compile(
     r"tilt(?:ed)?|azimuth(?:al)?|orient(?:ation|ed)?)(?:[xyz]|angles?|deg|rad|vec)*(?:m(?:ag)?)?"
     r"(?:about.*|[\W\d_].*)?")
 """Names of columns that say how a block lies; a rotor and the turns of a coil do not."""
-LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
+LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width", "outline")
+NUMBERS = ("recoil_permeability", "recoil_permeability_across", "magnetization_gradient",
+           "inner_corner_loss")
+"""Numbers without a unit, which are named as in a table of free blocks."""
 KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(
     LENGTHS, "length") | {
     f"{name}_{axis}": kind for axis in COMPONENTS for name, kind in (
@@ -86,27 +90,20 @@ KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys
 KELVIN = ("K", "kelvin")
 TEMPERATURES = ("C", "\u00b0C", "degC", "Celsius", "celsius", *KELVIN)
 """Units of temperatures; C if none is stated."""
-QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
+QUANTITIES = (*TEXTS, "temperature", "sides", *NUMBERS, *KIND)
 
 
 @dataclass(frozen=True)
 class DeclaredBlocks(DeclaredFormat):
-    """Statements of the user about a table of blocks.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
-        magnet) along which each component of the strength lies, as ``-y``.
-    along_block : bool
-        Whether components of the strength of free blocks lie along the block's own axes.
-    fixed : mapping of str to str
-        Value and unit of quantities for which the table has no column, such as ``12 cm^3``.
-    """
+    """Statements of the user about a table of blocks."""
 
     axes: tuple[str, str, str] = ("x", "y", "z")
+    """Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
+    magnet) along which each component of the strength lies, as ``-y``."""
     along_block: bool = False
+    """Whether components of the strength of free blocks lie along the block's own axes."""
     fixed: Mapping[str, str] = field(default_factory=dict)
+    """Value and unit of quantities for which the table has no column, such as ``12 cm^3``."""
     unused: ClassVar[tuple[str, ...]] = ("component", "at", "origin_m", "positions")
 
     def _wrong(self) -> dict[str, str]:
@@ -192,8 +189,7 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
 
 def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Table:
     """Return the cells of a table, whose header is the first line that names two quantities."""
-    delimiter = delimiter_of(max((line for _, line in lines), key=lambda one: sum(
-        one.count(mark) for mark in ",;\t")), declared)
+    delimiter = _delimiter(lines, declared)
     rows = [(number, cells_of(uncommented(line) if is_comment(line) else line, delimiter),
              is_comment(line)) for number, line in lines]
     start = next((n for n, (_, cells, _) in enumerate(rows)
@@ -222,6 +218,20 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         name: text.strip() for text, (name, _) in zip(own, header, strict=False) if name}
     return _Table(table, _with_stated(unit, declared, where), tuple(number for number, _ in body),
                   where, declared.decimal_comma, tuple(unknown), named)
+
+
+def _delimiter(lines: Sequence[Line], declared: DeclaredBlocks) -> str | None:
+    """Return what separates the cells: of the line of most marks, or of one that names two
+    quantities, as outlines have semicolons among commas.
+    """
+    found = delimiter_of(max((line for _, line in lines), key=lambda one: sum(
+        one.count(mark) for mark in ",;\t")), declared)
+    first = 100  # lines, below which there is no header
+    for _, line in lines[:first]:
+        own = delimiter_of(line, declared)
+        if sum(bool(quantity_of(cell)[0]) for cell in cells_of(uncommented(line), own)) > 1:
+            return own
+    return found
 
 
 def _header(
@@ -440,7 +450,7 @@ def _unread(table: _Table, free: bool) -> list[str]:
             "serial", "type", "ring", "slot"}
     sizes = {f"size_{axis}" for axis in COMPONENTS}
     if free:
-        read |= {"shape", "material", "sides"} | {
+        read |= {"shape", "material", "sides", *NUMBERS} | {
             name for name, kind in KIND.items() if kind in ("length", "angle")}
         read |= {"volume"} if strength == "moment" else set()
     else:
@@ -457,21 +467,12 @@ def _volume(table: _Table) -> Floats:
         len(table.lines), np.nan)
 
 
-def _turned(vectors: Floats, axes: Sequence[str]) -> Floats:
-    """Return vectors (n, 3) whose components lie along named axes, along x, y and z."""
-    found = np.empty_like(vectors)
-    for column, axis in enumerate(axes):
-        sign = -1.0 if axis.startswith("-") else 1.0
-        found[:, COMPONENTS.index(axis[-1])] = sign * vectors[:, column]
-    return found
-
-
 def _measured_blocks(
     table: _Table, declared: DeclaredBlocks, attributes: Mapping[str, str]
 ) -> BlockTable:
     """Return the table of measured blocks."""
     strength = _strength(table)
-    vectors = _turned(table.vector(strength), declared.axes)
+    vectors = to_magnet_axes(declared.axes, table.vector(strength))
     volume = _volume(table)
     moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # zero is refused below
@@ -516,6 +517,21 @@ def _whole(cell: str, name: str, line: int, table: _Table) -> int:
     return int(value)
 
 
+def _outlines(table: _Table) -> Iterator[tuple[tuple[float, ...], ...] | None]:
+    """Yield the corners in m of each block, None where the cell is empty."""
+    for cell, line in zip(table.cells["outline"], table.lines, strict=True):
+        try:
+            corners = outline_of(cell.replace(",", ".") if table.decimal_comma else cell
+                                 ) if cell else None
+        except ValueError:
+            raise MeasurementError(must_be(
+                f"outline in line {line}", table.where, "corners as `x y; x y; x y`",
+                f"'{cell[:40]}'")) from None
+        unit = table.unit["outline"]
+        yield corners and tuple(
+            tuple(np.round(units.in_si(np.array(corner), unit), 12).tolist()) for corner in corners)
+
+
 def _less_whole_turns(turns: dict[str, Floats]) -> dict[str, Floats]:
     """Return the components (n,) in rad of rotation vectors, without whole turns of 360 degrees."""
     squares = [np.nan_to_num(one)**2 for one in turns.values()]
@@ -541,8 +557,10 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
     for name in table.cells:
         own = name.removeprefix("at_") if name.startswith("at_") else name
         own, values = (f"{own}_deg", np.degrees) if KIND.get(name) == "angle" else (
-            f"{own}_m", np.asarray)
-        if own in FREE_COLUMNS:
+            own if name in NUMBERS else f"{own}_m", np.asarray)
+        if name == "outline":
+            columns[own] = [*_outlines(table)]
+        elif own in FREE_COLUMNS:
             si = turns[name] if name in turns else table.si(name)
             columns[own] = [None if np.isnan(value) else value
                             for value in np.round(values(si), 12).tolist()]
@@ -559,7 +577,7 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
                     "Leave them out."))
             columns["remanence_T"] = vectors[:, 0].tolist()
         else:
-            vectors = _turned(vectors, declared.axes)
+            vectors = to_magnet_axes(declared.axes, vectors)
             if declared.along_block:
                 turn = np.column_stack([turns.get(f"rotation_{axis}", np.zeros(len(vectors)))
                                         for axis in COMPONENTS])

@@ -47,74 +47,50 @@ MOST_RAD = 4 * np.pi
 
 @dataclass(frozen=True)
 class ForeignTable:
-    """The columns of a file in a foreign format, in the file's own units and axes.
-
-    Attributes
-    ----------
-    columns : tuple of Name
-        Names of the columns, with empty texts if the file does not name them.
-    values : ndarray, shape (n, columns)
-        In the file's units; NaN if a component was not measured, or a cell is no number.
-    where : str
-        Name of the file in error messages.
-    length_unit : str
-        Unit of lengths that state no unit of their own; empty if the file does not state it.
-    anchor : str
-        The point from which the file measures positions; empty if it is the magnet's centre.
-    comments : str
-        Comments of the file, on a single line.
-    texts : mapping of int to mapping of int to (int, str)
-        For each column that is not all numbers: line number and text of the other cells by row.
-    attributes : mapping of str to str
-        Attributes of a map in halbach-fe's own columns.
-    remarks : tuple of str
-        Sentences for the user about what the file says of its numbers.
-    added : int
-        Number of last columns that the rows of the file do not have.
-    """
+    """The columns of a file in a foreign format, in the file's own units and axes."""
 
     columns: tuple[ColumnName, ...]
+    """Names of the columns, with empty texts if the file does not name them."""
     values: Floats
+    """In the file's units; NaN if a component was not measured, or a cell is no number.
+    Shape (n, columns)."""
     where: str
+    """Name of the file in error messages."""
     length_unit: str = ""
+    """Unit of lengths that state no unit of their own; empty if the file does not state it."""
     anchor: str = ""
+    """The point from which the file measures positions; empty if it is the magnet's centre."""
     comments: str = ""
+    """Comments of the file, on a single line."""
     texts: dict[int, dict[int, Line]] = field(default_factory=dict)
+    """For each column that is not all numbers: line number and text of the other cells by row."""
     attributes: dict[str, str] = field(default_factory=dict)
+    """Attributes of a map in halbach-fe's own columns."""
     remarks: tuple[str, ...] = ()
+    """Sentences for the user about what the file says of its numbers."""
     added: int = 0
+    """Number of last columns that the rows of the file do not have."""
 
 
 @dataclass(frozen=True)
 class ImportedMap:
-    """A map and a summary of how it was read.
-
-    Attributes
-    ----------
-    data : xarray.Dataset
-        The map, in m and T along the magnet's axes.
-    length_units, field_units : tuple of str
-        Units of the file's columns.
-    ignored : tuple of str
-        Columns of the file that are not in the map.
-    dropped : int
-        Number of points without any measured component, which are not in the map.
-    cylindrical : bool
-        Whether the file has Br and Bphi, so that Bx and By are computed.
-    remarks : tuple of str
-        Sentences for the user about what the file says of its numbers, and what was done with it.
-    format : str
-        Name of the format of the file.
-    """
+    """A map and a summary of how it was read."""
 
     data: xr.Dataset
+    """The map, in m and T along the magnet's axes."""
     length_units: tuple[str, ...]
     field_units: tuple[str, ...]
+    """Units of the file's columns."""
     ignored: tuple[str, ...]
+    """Columns of the file that are not in the map."""
     dropped: int
+    """Number of points without any measured component, which are not in the map."""
     cylindrical: bool
+    """Whether the file has Br and Bphi, so that Bx and By are computed."""
     remarks: tuple[str, ...] = ()
+    """Sentences for the user about what the file says of its numbers, and what was done with it."""
     format: str = ""
+    """Name of the format of the file."""
 
 
 def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
@@ -805,10 +781,7 @@ def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
 def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) -> xr.Dataset:
     """Return the map without |B| ``total`` (n,) in T.
 
-    Raises
-    ------
-    MeasurementError
-        If values are too large for a permanent magnet.
+    MeasurementError if values are too large for a permanent magnet.
     """
     largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
     farthest = float(np.abs(points).max())

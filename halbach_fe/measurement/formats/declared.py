@@ -31,30 +31,6 @@ class DeclaredFormat:
 
     An empty value states nothing. ``columns`` take the place of the file's header; any other
     statement must agree with the file if the file contains the same information.
-
-    Attributes
-    ----------
-    length_unit, field_unit, angle_unit : str
-        Unit of all columns of this kind.
-    columns : tuple of str
-        Name of each column; ``-`` for a column to ignore.
-    component : str
-        Component x, y or z of a column that is named just B; ``abs`` if it is |B|, ``unknown`` if
-        nobody knows it.
-    at : mapping of str to float, in m
-        Constant coordinates, for which the file has no column.
-    origin_m : tuple of float or None
-        Position of the file's origin, in m along the magnet's axes.
-    decimal_comma : bool
-        Whether numbers have a decimal comma (0,5 is one half).
-    encoding : str
-        Encoding of a text file.
-    skip_lines : int
-        Number of lines at the beginning that are not read.
-    delimiter : str
-        One of `DELIMITERS`.
-    positions : Path or None
-        A table of x, y and z with a row for each reading of a file that has none.
     """
 
     unused: ClassVar[tuple[str, ...]] = ()
@@ -62,15 +38,26 @@ class DeclaredFormat:
     length_unit: str = ""
     field_unit: str = ""
     angle_unit: str = ""
+    """Unit of all columns of this kind."""
     columns: tuple[str, ...] = ()
+    """Name of each column; ``-`` for a column to ignore."""
     component: str = ""
+    """Component x, y or z of a column that is named just B; ``abs`` if it is |B|, ``unknown`` if
+    nobody knows it."""
     at: dict[str, float] = field(default_factory=dict)
+    """Constant coordinates, for which the file has no column. In m."""
     origin_m: tuple[float, float, float] | None = None
+    """Position of the file's origin, in m along the magnet's axes."""
     decimal_comma: bool = False
+    """Whether numbers have a decimal comma (0,5 is one half)."""
     encoding: str = "utf-8-sig"
+    """Encoding of a text file."""
     skip_lines: int = 0
+    """Number of lines at the beginning that are not read."""
     delimiter: str = ""
+    """One of `DELIMITERS`."""
     positions: Path | None = None
+    """A table of x, y and z with a row for each reading of a file that has none."""
 
     def unit_of(self, kind: str) -> str:
         """Return the unit of all columns of a kind, of `units.KINDS`; empty if none is stated."""

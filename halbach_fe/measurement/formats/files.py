@@ -72,7 +72,6 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
     Parameters
     ----------
-    path : Path
     declared : DeclaredFormat
         Statements of the user about the file.
     name : str
@@ -153,10 +152,7 @@ def with_positions(table: ForeignTable, path: Path, length_unit: str = "") -> Fo
 def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedMap | None:
     """Return a map in halbach-fe's own HDF5 or VTU, moved to the stated origin; None for others.
 
-    Raises
-    ------
-    MeasurementError
-        If it cannot be read, or the user states what the file says otherwise.
+    MeasurementError if it cannot be read, or the user states what the file says otherwise.
     """
     own_vtu = path.suffix == ".vtu" and (b'"B_T"' in raw or not paraview.is_paraview(raw))
     if not own_vtu and not (raw.startswith(openpmd.SIGNATURE) and openpmd.is_map(raw)):

@@ -60,17 +60,12 @@ HINT = ('A study with observation positions kind = "grid" has such points (start
 
 @dataclass(frozen=True)
 class Grid:
-    """B on a regular grid of points.
-
-    Attributes
-    ----------
-    axes : tuple of three ndarray, in m
-        Equally spaced, increasing coordinates along x, y and z.
-    field : ndarray, shape (nx, ny, nz, 3), in T
-    """
+    """B on a regular grid of points."""
 
     axes: tuple[Floats, Floats, Floats]
+    """Equally spaced, increasing coordinates along x, y and z. In m."""
     field: Floats
+    """Shape (nx, ny, nz, 3), in T."""
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -93,22 +93,15 @@ DIFFERENCE = re.compile(r"(?i)[^\W\d_]\w*\s*-\s*<?b(?![xyz]\b)")
 
 @dataclass(frozen=True)
 class ColumnName:
-    """The name of a column.
-
-    Attributes
-    ----------
-    text : str
-        Name as the file spells it.
-    quantity : str
-        One of `KNOWN`, `OTHERS` and, if stated, `MOVES`; Hx to Hphi of a column of H; empty if the
-        name is not recognized.
-    unit : str
-        Text of the unit as the file spells it; may be empty.
-    """
+    """The name of a column."""
 
     text: str
+    """Name as the file spells it."""
     quantity: str = ""
+    """One of `KNOWN`, `OTHERS` and, if stated, `MOVES`; Hx to Hphi of a column of H; empty if the
+    name is not recognized."""
     unit: str = ""
+    """Text of the unit as the file spells it; may be empty."""
 
 
 def in_units(quantities: Sequence[str], length: str, field: str = "T") -> tuple[ColumnName, ...]:

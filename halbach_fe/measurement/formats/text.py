@@ -221,12 +221,10 @@ def rows_of(
 
     Parameters
     ----------
-    lines : sequence of Line
     columns : int
         Number of cells that each row must have.
     delimiter : str or None
         See `delimiter_of`.
-    declared : DeclaredFormat
     where : str
         Name of the file in error messages.
 

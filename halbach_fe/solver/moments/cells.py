@@ -29,33 +29,23 @@ one is cut from its centroid to every other corner, which makes half as many cel
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of blocks, in the order of the blocks.
-
-    Attributes
-    ----------
-    block : ndarray of int, shape (n,)
-        Number of the block.
-    centre : ndarray, shape (n, 3), in m
-        Centroid, which is the origin of the cell's frame.
-    axes : ndarray, shape (n, 3, 3)
-        Axes of the frame as columns.
-    vertices : ndarray, shape (n, 4, 2), in m
-        Corners of the base in the frame, counter-clockwise; two coincide for a triangle.
-    half : ndarray, shape (n,), in m
-        Half the height.
-    cuboid : ndarray of bool, shape (n,)
-        Whether the base is a rectangle along the axes of the frame.
-    divisions : int
-        Number of nodes per direction.
-    """
+    """The cells of blocks, in the order of the blocks."""
 
     block: Ints
+    """Number of the block. Shape (n,)."""
     centre: Floats
+    """Centroid, which is the origin of the cell's frame. Shape (n, 3), in m."""
     axes: Floats
+    """Axes of the frame as columns. Shape (n, 3, 3)."""
     vertices: Floats
+    """Corners of the base in the frame, counter-clockwise; two coincide for a triangle.
+    Shape (n, 4, 2), in m."""
     half: Floats
+    """Half the height. Shape (n,), in m."""
     cuboid: Bools
+    """Whether the base is a rectangle along the axes of the frame. Shape (n,)."""
     divisions: int = 2
+    """Number of nodes per direction."""
 
     def __len__(self) -> int:
         return len(self.block)

@@ -81,22 +81,15 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Interaction:
-    """The field of cells, each uniformly polarized, in all cells.
-
-    Attributes
-    ----------
-    cells : Cells
-    opening : float
-        Two clusters interact by expansions if the sum of their radii is at most this fraction of
-        their distance. With 0 all interactions are exact.
-    degree, reading_degree : int
-        Degrees of the expansions between cells, and at points.
-    """
+    """The field of cells, each uniformly polarized, in all cells."""
 
     cells: Cells
     opening: float = 0.6
+    """Two clusters interact by expansions if the sum of their radii is at most this fraction of
+    their distance. With 0 all interactions are exact."""
     degree: int = 6  # the reaction of 96 cubes differs by less than 1e-5 from exact sums
     reading_degree: int = READING_DEGREE
+    """Degrees of the expansions between cells, and at points."""
 
     @cached_property
     def arrays(self) -> tuple[Any, ...]:

@@ -47,18 +47,12 @@ what is lost along the edges."""
 
 @dataclass(frozen=True)
 class KneeLaw:
-    """A demagnetization curve with a knee.
-
-    Attributes
-    ----------
-    coercivity_T : float
-        mu_0 H_cJ.
-    squareness : float
-        Ratio of H_k, where a tenth of the remanence is lost, to H_cJ; below 1.
-    """
+    """A demagnetization curve with a knee."""
 
     coercivity_T: float
+    """mu_0 H_cJ."""
     squareness: float
+    """Ratio of H_k, where a tenth of the remanence is lost, to H_cJ; below 1."""
 
     @classmethod
     def of(cls, material: Demagnetization) -> KneeLaw:
@@ -109,7 +103,6 @@ def solve_irreversible(
     ----------
     system : System
         The cells with the remanence that they had when they were saturated.
-    law : KneeLaw
     applied : callable, optional
         mu_0 H of other sources, such as iron.
     by_mean : bool

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csc_array
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints, of_length
+from halbach_fe.core.arrays import Floats, Ints, of_length, slices
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -64,27 +64,18 @@ Applied = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Moments:
-    """Polarized blocks.
-
-    Attributes
-    ----------
-    interaction : Interaction
-        The cells, and the sums over them.
-    induced : ndarray, shape (cells, q, 3), in T
-        Polarization ``J - B_r`` about every node of the cells.
-    blocks : int
-        Number of blocks, of which some may have no cells.
-    steps : int
-        Steps of the iteration.
-    susceptibility : float
-        The largest one of any cell, by which the error grows.
-    """
+    """Polarized blocks."""
 
     interaction: Interaction
+    """The cells, and the sums over them."""
     induced: Floats
+    """Polarization ``J - B_r`` about every node of the cells. Shape (cells, q, 3), in T."""
     blocks: int
+    """Number of blocks, of which some may have no cells."""
     steps: int
+    """Steps of the iteration."""
     susceptibility: float
+    """The largest one of any cell, by which the error grows."""
 
     @property
     def cells(self) -> Cells:
@@ -111,22 +102,15 @@ class Moments:
 
 @dataclass(frozen=True)
 class System:
-    """Cells of blocks with their materials; it can be solved again and again with other fields.
-
-    Attributes
-    ----------
-    interaction : Interaction
-    remanence : ndarray, shape (cells, 3), in T
-    susceptibility : ndarray, shape (cells, 3, 3)
-        Recoil permeability less 1.
-    blocks : int
-        Number of blocks. Those that have neither remanence nor susceptibility have no cells.
-    """
+    """Cells of blocks with their materials; it can be solved again and again with other fields."""
 
     interaction: Interaction
     remanence: Floats
+    """Shape (cells, 3), in T."""
     susceptibility: Floats
+    """Recoil permeability less 1. Shape (cells, 3, 3)."""
     blocks: int
+    """Number of blocks. Those that have neither remanence nor susceptibility have no cells."""
 
     @classmethod
     def of(cls, blocks: Sequence[MagnetBlock], cells_per_side: int | None = None,
@@ -232,10 +216,6 @@ def solve_moments(
         Nodes per direction in every cell.
     applied : callable, optional
         mu_0 H of other sources, such as iron.
-
-    Returns
-    -------
-    Moments
     """
     return System.of(blocks, cells_per_side, divisions).solve(applied)
 
@@ -379,11 +359,10 @@ def reaction_columns(
         deviations, extra = _deviations(system)
         panels = _Panels(system, extra, {})
         step = max(1, ENTRIES_AT_ONCE // (9 * len(system.remanence)))
-        for first in range(0, len(points), step):
-            part = slice(first, first + step)
+        for part in slices(len(points), step):
             found[:, part] = _columns_at(
                 system, np.array(points[part], float), deviations, panels,
-                partial(_report_progress, progress, first, len(points)))
+                partial(_report_progress, progress, part.start, len(points)))
     return lambda number, some: found[number, some]
 
 
@@ -395,18 +374,12 @@ def _report_progress(progress: Progress | None, before: int, total: int, done: i
 
 @dataclass(frozen=True)
 class _Deviations:
-    """The polarization at nodes beyond its mean, per polarization of near cells.
-
-    Attributes
-    ----------
-    close : Neighbours
-        Pairs of a cell and the near ones that polarize it.
-    matrices : ndarray, shape (pairs, q, 3, 3)
-        In single precision, whose error is 1e-7 of these polarizations.
-    """
+    """The polarization at nodes beyond its mean, per polarization of near cells."""
 
     close: Neighbours
+    """Pairs of a cell and the near ones that polarize it."""
     matrices: NDArray[np.float32]
+    """In single precision, whose error is 1e-7 of these polarizations. Shape (pairs, q, 3, 3)."""
 
     def add(self, by_node: Floats, to: Floats) -> None:
         """Add readings per polarization of the cells, by those per polarization of the nodes.

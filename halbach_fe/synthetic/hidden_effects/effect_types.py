@@ -36,49 +36,35 @@ FEW_BLOCKS = 64
 
 @dataclass(frozen=True)
 class Site:
-    """The sizes of a study's magnet and map, from which amplitudes are drawn.
-
-    Attributes
-    ----------
-    dimension, rings, slots : int
-        Dimension of the study, number of rings, and largest number of blocks per ring.
-    inner, outer, half_length : float, in m
-        Radii and half length of the array; infinite length in two dimensions.
-    permeability, most_permeable : float
-        Smallest and largest relative recoil permeability.
-    has_iron : bool
-        Whether the study has an iron ring.
-    components : tuple of str
-        Components of B that are observed.
-    radius, z_min, z_max : float, in m
-        Largest radius and limits of z of all points, the held-out ones included.
-    places : tuple of pairs of int
-        Ring and slot of every block.
-    is_uniform : bool
-        Whether the array consists of equal rings only.
-    has_four_edges : bool
-        Whether all blocks have four edges.
-    is_of_length : bool
-        Whether the map is of |B|: its probe is a single sensor, that of x, and has no axes.
-    """
+    """The sizes of a study's magnet and map, from which amplitudes are drawn."""
 
     dimension: int
     rings: int
     slots: int
+    """Dimension of the study, number of rings, and largest number of blocks per ring."""
     inner: float
     outer: float
     half_length: float
+    """Radii and half length of the array; infinite length in two dimensions. In m."""
     permeability: float
     most_permeable: float
+    """Smallest and largest relative recoil permeability."""
     has_iron: bool
+    """Whether the study has an iron ring."""
     components: tuple[Component, ...]
+    """Components of B that are observed."""
     radius: float
     z_min: float
     z_max: float
+    """Largest radius and limits of z of all points, the held-out ones included. In m."""
     places: tuple[tuple[int, int], ...]
+    """Ring and slot of every block."""
     is_uniform: bool
+    """Whether the array consists of equal rings only."""
     has_four_edges: bool
+    """Whether all blocks have four edges."""
     is_of_length: bool = False
+    """Whether the map is of |B|: its probe is a single sensor, that of x, and has no axes."""
 
     @property
     def scale(self) -> float:
@@ -129,20 +115,14 @@ LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.
 
 @dataclass(frozen=True)
 class HiddenParameter:
-    """A parameter of an effect; without a unit it is a count, a fraction or a factor.
-
-    Attributes
-    ----------
-    name, unit : str
-    least, most : float, optional
-        Smallest and largest value that a magnet or an instrument can have; by default those of the
-        unit, of either sign.
-    """
+    """A parameter of an effect; without a unit it is a count, a fraction or a factor."""
 
     name: str
     unit: str = ""
     least: float | None = None
     most: float | None = None
+    """Smallest and largest value that a magnet or an instrument can have; by default those of the
+    unit, of either sign."""
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -170,36 +150,25 @@ Draw = Callable[[Site, np.random.Generator], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """A deviation from the study that a campaign can hide in its truth.
-
-    Attributes
-    ----------
-    name : str
-    group : str
-        ``field`` for effects of the magnet or its surroundings, ``instrument`` for those of the
-        mapper, ``gross`` for gross errors.
-    parameters : tuple of HiddenParameter
-    draw : callable
-        Function of site and random generator that returns values. Their size is realistic, and
-        large enough to be visible in a map.
-    magnet, instrument : callable, optional
-        Function of a magnet (or an instrument), the site and the values that returns the magnet (or
-        instrument) with the effect; an effect has one of the two.
-    needs : tuple of Need
-        Requirements on the study.
-    of_blocks : bool
-        Whether the blocks have the effect before they are mounted, so that the Helmholtz coil
-        measures it too.
-    """
+    """A deviation from the study that a campaign can hide in its truth."""
 
     name: str
     group: Literal["field", "instrument", "gross"]
+    """``field`` for effects of the magnet or its surroundings, ``instrument`` for those of the
+    mapper, ``gross`` for gross errors."""
     parameters: tuple[HiddenParameter, ...]
     draw: Draw
+    """Function of site and random generator that returns values. Their size is realistic, and large
+    enough to be visible in a map."""
     magnet: Callable[..., TrueMagnet] | None = None
     instrument: Callable[..., FaultyInstrument] | None = None
+    """Function of a magnet (or an instrument), the site and the values that returns the magnet (or
+    instrument) with the effect; an effect has one of the two."""
     needs: tuple[Need, ...] = ()
+    """Requirements on the study."""
     of_blocks: bool = False
+    """Whether the blocks have the effect before they are mounted, so that the Helmholtz coil
+    measures it too."""
 
 
 @dataclass(frozen=True)
