@@ -203,9 +203,9 @@ def _stationary(
     """Return the stationary point of the component along the field, and its standard deviations.
 
     Both are (3,) in m. They are empty if the point is not in the sphere of a ``radius`` in m, on
-    which B (26, 3) is given: farther away the field of a homogeneous magnet may be stationary
-    anywhere. The curvatures count as those of the mean magnetizations. ``columns`` (26, 3,
-    parameters) belong to B.
+    which B (26, 3) is given, or may be out of it by its standard deviations: farther away the field
+    of a homogeneous magnet may be stationary anywhere. The curvatures count as those of the mean
+    magnetizations. ``columns`` (26, 3, parameters) belong to B.
     """
     fit = np.linalg.pinv(solid_harmonic_fields(_ON_SPHERE, _DEGREES).reshape(field.size, -1))
     amplitudes = fit @ field.ravel()
@@ -229,5 +229,7 @@ def _stationary(
     changes = [slopes(found.x + near * axis) - slopes(found.x - near * axis) for axis in np.eye(3)]
     curvature = np.array([change @ amplitudes for change in changes]).T / (2 * near)
     rows = -np.linalg.solve(curvature, slopes(found.x) @ (fit @ columns.reshape(field.size, -1)))
-    return (tuple((radius * found.x).tolist()),
-            tuple((radius * magnetizations.sd_of(rows)).tolist()))
+    sd = magnetizations.sd_of(rows)
+    if np.linalg.norm(sd) > 1:
+        return ()
+    return tuple((radius * found.x).tolist()), tuple((radius * sd).tolist())

@@ -184,6 +184,17 @@ def test_the_centre_of_blocks_that_deviate_is_where_the_field_is_stationary(gene
     assert centre(-turned.ravel()) == pytest.approx(found * [-1, -1, 1], abs=1e-9)
 
 
+@pytest.mark.parametrize(("share", "there"), [(1e-4, True), (0.3, False)])
+def test_a_centre_that_may_be_anywhere_is_none(tmp_path, share, there):
+    """By linear error bars of decimetres the centre of a measured dipole was 1 ± 293 mm."""
+    magnet = build_magnet(study(1))
+    mean = magnet.nominal_magnetization
+    axis = magnetic_axis(magnet, Session.open(tmp_path), Gaussian(
+        mean, share * np.abs(mean).max() * np.eye(len(mean))))
+    assert (axis.centre_m is not None) is there
+    assert axis.roll_sd_rad > 0
+
+
 def test_a_cross_section(tmp_path, dipole):
     magnet = build_magnet(dipole(array__recoil_permeability=1.0))
     nominal = magnet.nominal_magnetization
