@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 
+import magpylib
 import numpy as np
+import xarray as xr
+from scipy.stats import chi2
 
 from benchmarks.note import Note
+from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.measurement.field_map import write_map
 from halbach_fe.measurement.map_check import SIGNIFICANT, check_map
 from halbach_fe.measurement.map_join import join_maps
-from tests.support import joined_campaigns
+from tests.support import cube_dipole, joined_campaigns
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 
 RESULTS = Path(__file__).parent.parent / "results" / "calibration" / "calibration.json"
@@ -64,6 +70,83 @@ def instrument(note: Note) -> None:
          f"bars in {visible}; asked: 0.9 at least")
     note("check.instrument_within_2sd", within / MAPS, "ratio",
          "the same maps: share whose error is within 2 sd, found or not")
+
+
+def _ring_along_z(magnet: magpylib.Collection) -> None:
+    for cube in magnet.sources[12:]:
+        cube.move((0.0, 0.0, 3e-4))
+
+
+def _cube_outwards(magnet: magpylib.Collection) -> None:
+    cube = magnet.sources[4]
+    cube.move(5e-4 * np.array([*cube.position[:2], 0.0]) / np.hypot(*cube.position[:2]))
+
+
+def _weak_cube(magnet: magpylib.Collection) -> None:
+    magnet.sources[7].polarization = 0.9 * magnet.sources[7].polarization
+
+
+def _halves_apart(magnet: magpylib.Collection) -> None:
+    for cube in magnet.sources:
+        cube.move((1e-4 * np.sign(cube.position[0]), 0.0, 0.0))
+
+
+def _object_outside(magnet: magpylib.Collection) -> None:
+    magnet.add(magpylib.misc.Dipole(moment=(0.05, 0.02, 0.03), position=(0.11, 0.05, 0.02)))
+
+
+def _field_outside(magnet: magpylib.Collection) -> None:
+    magnet.add(magpylib.current.Circle(diameter=4.0, current=300.0))  # some 0.1 mT
+
+
+LACKING = (_ring_along_z, _cube_outwards, _weak_cube, _halves_apart, _object_outside,
+           _field_outside)
+"""What a magnet of two rings of twelve cubes has and its study does not, of usual sizes."""
+
+
+def joined_lacking(note: Note) -> None:
+    """Note how often bars of poses hold that `register --joined` says Yes to, of magnets that have
+    something which the study lacks.
+    """
+    held, yes = 0, 0
+    for number in range(CAMPAIGNS):
+        maps, poses, _ = joined_campaigns.campaign(
+            2 * number + 1, changed=LACKING[number % len(LACKING)])
+        with tempfile.TemporaryDirectory() as name:
+            for each, within in _registered(Path(name), maps, poses):
+                yes += each
+                held += each and within
+    note("joined.yes_rate_lacking", yes / (3 * CAMPAIGNS), "ratio",
+         f"of {3 * CAMPAIGNS} maps of magnets of cubes with one of {len(LACKING)} effects that "
+         "the study lacks: share with the answer Yes")
+    note("joined.coverage_lacking", held / yes, "ratio",
+         "of these, whose place in the magnet is within the 95 % bars along all axes; asked: 0.9")
+
+
+def _registered(
+    folder: Path, maps: dict[str, xr.Dataset], poses: list[joined_campaigns.Pose]
+) -> list[tuple[bool, bool]]:
+    """Return of each map whether `register --joined` says Yes, and whether the magnet's place on
+    its stage is within the bars.
+    """
+    for name, data in maps.items():
+        write_map(data, folder / f"{name}.csv")
+    (folder / "study.toml").write_text(cube_dipole.noisier(joined_campaigns.NOISE_T) + "".join(
+        f'[[maps]]\nname = "{name}"\nfile = "{name}.csv"\n' for name in maps))
+    joined, found = folder / "joined", folder / "registered"
+    for arguments in (["check", *(folder / f"{name}.csv" for name in maps), "-o", joined],
+                      ["register", folder / "study.toml", "--joined", joined / "joined.json", "-o",
+                       found]):
+        if main([str(each) for each in arguments]):
+            return []
+    told = []
+    for name, (turn, shift) in zip(maps, poses, strict=True):
+        best = json.loads((found / name / "registration.json").read_text(encoding="utf-8"))[
+            "poses"][0]
+        error = np.array(best["magnet_on_stage_m"]) - turn.inv().apply(-shift)
+        within = chi2.cdf(np.sum((error / best["magnet_on_stage_sd_m"])**2), 3) < 0.95
+        told.append((best["sound"], bool(within)))
+    return told
 
 
 CAMPAIGNS = 30

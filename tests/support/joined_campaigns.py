@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import magpylib
 import numpy as np
 import xarray as xr
@@ -41,14 +43,17 @@ MAGNETS = (quadrupole, cubes)
 
 
 def campaign(
-    seed: int, maps: int = 3, noise: float = NOISE_T
+    seed: int, maps: int = 3, noise: float = NOISE_T,
+    changed: Callable[[magpylib.Collection], None] = lambda _: None,
 ) -> tuple[dict[str, xr.Dataset], list[Pose], magpylib.Collection]:
     """Maps along the magnet that overlap by 20 mm, where their stages stand, and the magnet.
 
     A place p of a stage is turn p + shift: turns are some 10 mrad, shifts off by millimetres.
+    The magnet may be ``changed`` before it is mapped.
     """
     generator = np.random.default_rng([seed, 460])
     magnet = MAGNETS[seed % len(MAGNETS)](generator)
+    changed(magnet)
     found, poses = {}, []
     for number in range(maps):
         pose = (Rotation.from_rotvec(0.01 * generator.standard_normal(3)),
