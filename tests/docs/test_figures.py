@@ -42,7 +42,7 @@ QUOTED = {
     ("docs/accuracy.md", "sphere of permeability 1000"): ("iron_any.error_sphere",),
     ("docs/accuracy.md", "four cubes between two plates"): ("iron_any.error_plates",),
     ("docs/accuracy.md", "quadrupole of four poles"): ("iron_any.error_quadrupole",),
-    ("docs/accuracy.md", "longest, for two blocks"): ("iron_any.time_over_ngsolve",),
+    ("docs/accuracy.md", "longest, for five cubes"): ("iron_any.time_over_ngsolve",),
     ("docs/accuracy.md", "five cubes on a plate"): ("iron_any.error_back_plate",),
     ("docs/accuracy.md", "two blocks on the arms of a C"): ("iron_any.error_c_yoke",),
     ("docs/accuracy.md", "processor time |"): ("iron_any.columns_time_over_field",),
