@@ -105,14 +105,16 @@ class Surface:
 
         Points on a face of iron are too near, and those beside a round one may lie in the mesh.
         """
-        from halbach_fe.solver.tetrahedra import RESOLVED  # imports numba
+        from halbach_fe.solver.tetrahedra import DEEPEST, NEAR  # imports numba
+
+        resolved = NEAR / 2**DEEPEST  # distance over size of an element from which it is exact
 
         found = np.array(points)
         for _ in range(3):  # where two faces meet at an inner corner, each in turn
             foot, normal, face = self._nearest(found)
             near = np.flatnonzero(face >= 0)
             apart = found[near] - foot[near]
-            distance, size = np.linalg.norm(apart, axis=1), RESOLVED * self.reach[face[near]]
+            distance, size = np.linalg.norm(apart, axis=1), resolved * self.reach[face[near]]
             height = np.einsum("ni,ni->n", apart, normal[near])
             outside = (height > 0) & (distance > 1e-3 * size)
             moved = (distance < 0.999 * size) | (height < 0)

@@ -14,9 +14,6 @@ NEAR, DEEPEST = 2.0, 8
 and how often it does at most. At points of blocks that touch a yoke the error is 4e-5 of the field
 rms and 2e-4 at most; with 3 it is a twentieth, in three times as long, with 1.5 it is 5e-4 rms."""
 
-RESOLVED = NEAR / 2**DEEPEST
-"""Distance of a point from an element, by the size of this, from which `add_field` is exact."""
-
 
 @compiled
 def sweep(starts: Ints, columns: Ints, values: Floats, right: Floats, found: Floats,
