@@ -120,7 +120,8 @@ def joined_lacking(note: Note) -> None:
          f"of {3 * CAMPAIGNS} maps of magnets of cubes with one of {len(LACKING)} effects that "
          "the study lacks: share with the answer Yes")
     note("joined.coverage_lacking", held / yes, "ratio",
-         "of these, whose place in the magnet is within the 95 % bars along all axes; asked: 0.9")
+         "of these, where the error of the place, over its bars, is within the 95 % of three axes "
+         "together; asked: 0.9")
 
 
 def _registered(

@@ -270,7 +270,7 @@ def _assemble(
     # bars, if columns only serve for deviations: blocks deviate by less than a tenth of their
     # magnetization
     deviation = 0.1
-    if parts.linearized or parts.for_deviations:
+    if parts.for_deviations:
         unequal *= deviation
         field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal

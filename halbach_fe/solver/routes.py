@@ -148,8 +148,9 @@ class ElementFields:
     nominal: Floats
     """The whole array, solved for at once. Shape (n, 3), in T."""
     along_nominal: Floats
-    """The value to which the blocks must add up: ``nominal``, or with non-linear iron the
-    derivative of the field along the nominal magnetization. Shape (n, 3), in T."""
+    """The value to which the blocks must add up: ``nominal``; with non-linear iron the derivative
+    of the field along the nominal magnetization, and where blocks have larger elements than the
+    array, the array on these. Shape (n, 3), in T."""
     sources: tuple[MagnetBlock, ...]
     """The blocks of the array for which single blocks were solved."""
     block: Callable[[int, Ints | slice], Floats]
@@ -165,11 +166,6 @@ class ElementFields:
     than their sum. Derivatives at the nominal array do so too."""
     anywhere: bool = False
     """Whether points may lie in magnet and iron, of a cross-section."""
-
-    @property
-    def linearized(self) -> bool:
-        """Whether the blocks' parts are derivatives at the nominal array, with non-linear iron."""
-        return self.nominal is not self.along_nominal
 
 
 def solve_nominal(
@@ -314,9 +310,9 @@ def finite_element_part(
         source_fields = np.moveaxis(fields[first:first + size, index[number][some]], 0, 2)
         return placement.from_source(source_fields)
 
-    along = fields[0, here] if coarser or magnet.is_nonlinear else nominal
-    return ElementFields(route.superposition_tolerance(magnet, placed), nominal, along,
-                         magnet.blocks, block, for_deviations=coarser, anywhere=anywhere)
+    return ElementFields(route.superposition_tolerance(magnet, placed), nominal, fields[0, here],
+                         magnet.blocks, block, anywhere=anywhere,
+                         for_deviations=coarser or magnet.is_nonlinear)
 
 
 def _moments_part(
