@@ -25,13 +25,13 @@ from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, m
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
-from halbach_fe.inference.pose_search import NARROW
-from halbach_fe.inference.pose_space import (
+from halbach_fe.inference.pose_search import (
     LONGEST_M,
     LONGEST_RAD,
+    NARROW,
     Field,
+    line_of,
     moved_by,
     right_angles,
     share_of,

@@ -30,8 +30,7 @@ from halbach_fe.core.pace import QUIET_S, Pace, duration
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
-from halbach_fe.inference.pose_search import coarse_poses
-from halbach_fe.inference.pose_space import right_angles
+from halbach_fe.inference.pose_search import coarse_poses, right_angles
 from halbach_fe.measurement.campaign import refuse_unordered
 from halbach_fe.measurement.field_map import checked_map, directed, is_undirected, taking_arrays
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
