@@ -18,11 +18,14 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import MeasuredPrior, prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
     Beside,
+    Magnitudes,
     OpenTerms,
     amplitude_columns,
+    bent,
     joined,
     of_the_first,
     readings_of_field,
+    warn_of_bent_readings,
 )
 from halbach_fe.inference.overlap import left_out, overlaps
 from halbach_fe.inference.readings import (
@@ -39,7 +42,6 @@ from halbach_fe.inference.result import (
     MapPose,
     Prediction,
 )
-from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.field_map import points_of, taking_arrays
