@@ -247,7 +247,7 @@ def _run_campaign(
 ) -> int:
     """Register all maps that the study lists, each with a page in a folder of its own."""
     from halbach_fe.core.files import make_folder
-    from halbach_fe.inference.campaign_registration import register_maps, registered_study
+    from halbach_fe.inference.registration import register_maps, registered_study
     from halbach_fe.measurement.campaign import maps_of
     from halbach_fe.measurement.map_join import read_joined
     from halbach_fe.report.page import write_changed_study, write_files

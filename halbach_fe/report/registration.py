@@ -13,12 +13,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import block_images
-from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
     UNDECIDED_LOG_EVIDENCE,
     axes_of_map,
+    moved_by_turns,
     nearest_right_angles,
     odds,
     turn_from_axes,
