@@ -20,8 +20,8 @@ from halbach_fe.diagnosis.effects.base import Parameter
 from halbach_fe.diagnosis.linearization import apply_effects
 from halbach_fe.diagnosis.model_selection import WIDE_PRIOR_FROM, WIDE_PRIOR_SD
 from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.study.inference import Uncertain, number_changes
 from halbach_fe.study.model import Study
-from halbach_fe.study.uncertain import Uncertain, number_changes
 
 STEP = 1e-3
 """Step of the differences by an amplitude, in its prior standard deviations, see

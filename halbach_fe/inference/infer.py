@@ -68,8 +68,8 @@ from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
-from halbach_fe.study.uncertain import Uncertain
 
 ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its

@@ -49,9 +49,9 @@ from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.inference import shifted
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.study.uncertain import shifted
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def amplitude_columns(
 ) -> Floats:
     """Return the derivatives (readings, amplitudes) in T by what is uncertain of the instruments.
 
-    They are per standard deviation, see `halbach_fe.study.uncertain.Uncertain`, of what a reading
+    They are per standard deviation, see `halbach_fe.study.inference.Uncertain`, of what a reading
     shows less what is subtracted from it.
 
     Parameters
