@@ -23,15 +23,6 @@ from halbach_fe.inference.readings import Readings, unit_vectors
 from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
-    in_si_and_magnet_axes,
-    map_time,
-    remove_nonlinear_part,
-    sensor_matrix,
-    sensor_positions,
-    total_without_nonlinear_part,
-    turn_of,
-)
-from halbach_fe.measurement.instrument_terms import (
     APART,
     DRIFTS,
     NAMES,
@@ -40,8 +31,15 @@ from halbach_fe.measurement.instrument_terms import (
     SENSORS,
     by_terms,
     field_at_sensors,
+    in_si_and_magnet_axes,
+    map_time,
     prior_sd,
+    remove_nonlinear_part,
     seen,
+    sensor_matrix,
+    sensor_positions,
+    total_without_nonlinear_part,
+    turn_of,
     with_terms,
 )
 from halbach_fe.measurement.observation import Observation

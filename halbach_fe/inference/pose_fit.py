@@ -49,13 +49,6 @@ from halbach_fe.measurement.doubted_terms import (
 )
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
-    in_si_and_magnet_axes,
-    remove_nonlinear_part,
-    sensor_matrix,
-    sensor_positions,
-    total_without_nonlinear_part,
-)
-from halbach_fe.measurement.instrument_terms import (
     DIFFERENCE_M,
     NAMES,
     POSE,
@@ -63,8 +56,13 @@ from halbach_fe.measurement.instrument_terms import (
     STEADY,
     by_terms,
     field_at_sensors,
+    in_si_and_magnet_axes,
+    remove_nonlinear_part,
     seen,
+    sensor_matrix,
+    sensor_positions,
     sensors_apart,
+    total_without_nonlinear_part,
     with_terms,
 )
 from halbach_fe.measurement.observation import (

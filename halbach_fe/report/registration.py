@@ -41,12 +41,14 @@ from halbach_fe.measurement.field_map import (
     write_map,
 )
 from halbach_fe.measurement.instrument import (
+    CROSSTALK,
+    PROBE,
+    STEADY,
     in_si_and_magnet_axes,
     probe_points,
     row_order_note,
     turn_of,
 )
-from halbach_fe.measurement.instrument_terms import CROSSTALK, PROBE, STEADY
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,

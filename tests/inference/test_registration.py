@@ -32,7 +32,7 @@ from halbach_fe.inference.registration import (
 )
 from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.measurement.instrument_terms import NAMES
+from halbach_fe.measurement.instrument import NAMES
 from halbach_fe.report.registration import (
     AT_REST,
     NOT_AT_REST,
