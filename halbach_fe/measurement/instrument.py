@@ -33,7 +33,7 @@ from halbach_fe.measurement.field_map import (
     points_of,
     refuse_undirected,
 )
-from halbach_fe.measurement.scan_lines import motion
+from halbach_fe.measurement.positions import motion
 from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

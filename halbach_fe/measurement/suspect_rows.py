@@ -12,7 +12,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.core.pace import Pace
 from halbach_fe.measurement.field_map import TOTAL_COLUMN
-from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.measurement.positions import point_spacing
 
 SPIKE = 12.0
 """A reading is a spike if its residual is larger than this multiple of the standard deviation of
