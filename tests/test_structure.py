@@ -32,8 +32,7 @@ ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
 MAY_IMPORT = {
     "stats": ("core",), "solver.ring_harmonics_2d": ("core",),
     "synthetic": ("core", "study", "measurement.field_map", "measurement.block_table",
-                  "measurement.positions", "measurement.reading_noise",
-                  "measurement.scan_lines")}
+                  "measurement.positions", "measurement.reading_noise")}
 
 
 def imports(path):

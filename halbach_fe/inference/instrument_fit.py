@@ -1,8 +1,13 @@
-"""Terms of the instruments as parameters of the update, beside the magnetizations.
+"""Readings that are linear only about what an update finds: by terms of instruments, and of |B|.
 
-The readings are linear in small changes of the terms, by the gradient of the field of the magnet
-as it is estimated. The update is therefore repeated about what it found, until the terms are at
-rest.
+The terms of the instruments are parameters of the update, beside the magnetizations. The readings
+are linear in small changes of the terms, by the gradient of the field of the magnet as it is
+estimated. The update is therefore repeated about what it found, until the terms are at rest.
+
+A probe of |B| shows the length of B. About a field B_0 it is the component along B_0, but for
+``|c|^2 / 2 |B_0|`` by the deviation c across it. Here too an update is repeated about what it has
+found. What is not known of c bends the readings: its mean square over 2 |B_0| counts as noise,
+which makes readings of a weak field count little until an update knows the field there.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pose of a map in the magnet, found from nothing, and the probe's axes.
+"""The pose of one or several maps in the magnet, found from nothing, and the probe's axes.
 
 A stage has coordinates of its own: its origin is somewhere, its axes point somewhere, and the axes
 of the probe point elsewhere again. Two steps find the rotation and the translation that bring the
@@ -11,6 +11,10 @@ map's coordinates to those of the magnet.
    together with the magnetizations of the blocks, whose prior is that of the study. The evidence
    compares the candidates. A symmetric magnet makes some of them equal, and all of these are
    results.
+
+Of several maps the first is registered with the study's prior of the blocks, every later one with
+the blocks as the maps before have updated them. A later map therefore also tells apart poses
+between which the nominal magnet looks the same.
 """
 
 from __future__ import annotations

@@ -8,6 +8,11 @@ applied in three ways:
   of the model of a reading (`sensor_model`).
 * All other effects (offset, drift, nonlinearity and memory) are subtracted from the map
   (`remove_nonlinear_part`).
+
+A fit changes the terms of an instrument as numbers, in a vector (30,) of their changes: shift of
+the map's middle and turn about it, along the magnet's axes, then crosstalk, gains, offsets, places
+of the sensors, and drift. Of the places of the sensors only differences count: what all sensors
+have in common is a shift of the map.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The points at which a study observes the field."""
+"""The points at which a field is observed, and the lines in which a stage has scanned them.
+
+Some of the lines are held out as a test.
+"""
 
 from __future__ import annotations
 
