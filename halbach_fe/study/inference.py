@@ -1,4 +1,4 @@
-"""Keys of a study that describe the inference: prior, readings left out, plan, maps, uncertainties."""
+"""Keys of a study that describe the inference: prior, held-out readings, plan, maps, doubts."""
 
 from __future__ import annotations
 
