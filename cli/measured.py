@@ -124,7 +124,7 @@ def check(arguments: argparse.Namespace) -> int:
             page = map_check.joined_page(named, hf.join_maps(
                 named, say, show, arguments.turn_rad or TURN_RAD))
         elif is_total_field(maps[0]):
-            from halbach_fe.measurement.total_check import check_total
+            from halbach_fe.measurement.suspect_rows import check_total
 
             page = map_check.total_page(maps[0], check_total(maps[0]))
         else:
