@@ -159,7 +159,7 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
 
 def _calibration(parser: argparse.ArgumentParser) -> None:
     """Add --calibration."""
-    from halbach_fe.measurement.calibration import HEADER
+    from halbach_fe.measurement.formats.files import HEADER
 
     option("--calibration", input_file, "TABLE",
            "CSV file with the errors of the probe's sensors against a reference, "
@@ -182,10 +182,9 @@ def import_map(arguments: argparse.Namespace) -> int:
     """
     import numpy as np
 
-    from halbach_fe.measurement.calibration import read_calibration
     from halbach_fe.measurement.field_map import refuse_total_field
     from halbach_fe.measurement.formats.declared import DeclaredFormat
-    from halbach_fe.measurement.formats.files import import_map
+    from halbach_fe.measurement.formats.files import import_map, read_calibration
 
     common.own_file(arguments, arguments.file, *filter(None, [arguments.calibration]))
     imported = import_map(arguments.file, declared(arguments, DeclaredFormat), arguments.format)
