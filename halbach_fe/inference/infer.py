@@ -65,9 +65,8 @@ from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.linear_gaussian import Rows, predict
-from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
 

@@ -49,9 +49,14 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.matrix import Response
-from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
+from halbach_fe.stats.gaussian import (
+    CovarianceFactor,
+    Gaussian,
+    NoiseCovariance,
+    root_matrix,
+    stacked_root,
+)
 from halbach_fe.stats.linear_gaussian import Rows, predict
-from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.inference import shifted
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS

@@ -43,9 +43,8 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
-from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.inference import shifted
 from halbach_fe.study.model import Study
 

@@ -48,8 +48,8 @@ from halbach_fe.solver.routes import (
     vacuum_part,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Rows
 from halbach_fe.stats.linear_gaussian import row_slices
-from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import FIELD_KEYS
 
