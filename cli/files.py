@@ -336,7 +336,7 @@ def export(arguments: argparse.Namespace) -> int:
     With the format blocks, the input is a study, and the file a table of free blocks (CSV or HDF5):
     all blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
     """
-    from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
+    from halbach_fe.geometry.array_layout import beside_blocks, blocks_table
     from halbach_fe.measurement.formats.files import export_map
     from halbach_fe.study.free_blocks_file import write_free_blocks
 

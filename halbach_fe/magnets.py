@@ -24,7 +24,7 @@ from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.result_folder import single_file
-from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_outline
+from halbach_fe.geometry.array_layout import beside_blocks, blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.positions import points_from
