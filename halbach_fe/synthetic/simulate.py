@@ -49,10 +49,14 @@ from halbach_fe.synthetic.hidden_effects import (
     with_effects,
 )
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
-from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
-from halbach_fe.synthetic.reaction import by_elements, lone_moment_matrix, reaction_field
+from halbach_fe.synthetic.reaction import (
+    by_elements,
+    lone_moment_matrix,
+    lost_field,
+    reaction_field,
+)
 from halbach_fe.synthetic.shapes import Shape
 from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Body, TrueMagnet, in_places, vector
 
