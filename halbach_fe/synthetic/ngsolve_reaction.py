@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
-from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.installation import import_extra
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape

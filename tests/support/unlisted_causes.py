@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.installation import import_extra
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.model import Study
