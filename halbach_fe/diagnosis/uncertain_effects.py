@@ -1,9 +1,16 @@
-"""What is uncertain of the effects that were found, as tables ``[[uncertain]]`` of the study.
+"""How well a map knows effects: those that were found, and changes too small to be found.
 
-The standard deviation in such a table is the prior one of the effect, about the amplitude that was
+What is uncertain of the effects that were found becomes tables ``[[uncertain]]`` of the study. The
+standard deviation in such a table is the prior one of the effect, about the amplitude that was
 found. The posterior one would count the readings twice: `infer` uses the same map again, and finds
 the amplitude anew, with its correlations with all blocks and other amplitudes. What the readings do
 not tell from an effect is in the study beside it.
+
+The smallest change of a block that a map would have shown: a change of known size makes the log
+Bayes factor of its effect rise with the square of the amplitude, by the information matrix of its
+signatures with the blocks integrated out. The limit is the amplitude at which the posterior odds
+pass the threshold of naming, without noise: about half of all changes of that size would be named,
+and nearly all of half again as much.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""The layout of an array: position, shape and nominal magnetization of every block."""
+"""The layout of an array: position, shape and nominal magnetization of every block.
+
+Free blocks come from the columns of a table, and the blocks of any magnet go into one. That of
+`blocks_table` describes the magnet as built: displaced, rotated and weakened blocks become free
+blocks of their own place and remanence, and missing blocks are left out. `build_magnet` of a study
+with this table gives the same field in vacuum, and the same permeabilities.
+"""
 
 from __future__ import annotations
 

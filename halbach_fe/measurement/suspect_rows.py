@@ -1,4 +1,9 @@
-"""Rows of a map that cannot be readings of a field without sources: zeros, repetitions, spikes."""
+"""Rows of a map that cannot be readings of a field without sources: zeros, repetitions, spikes.
+
+Of a map of |B| alone they, its noise and its drift are all that it shows by itself: |B| is the
+length of a harmonic vector and no solution of a linear equation. Maxwell's equations do not test
+it, nor does it show axes, signs or gains of a probe.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,11 @@
-"""Normal distributions of the block magnetizations and square roots of their covariances.
+"""Normal distributions: of block magnetizations by roots of their covariances, and of the noise.
 
 A root of a covariance C, also called a covariance factor, is any matrix L (m, k) with C = L L'.
+
+The noise of readings has mean 0. Readings of the same point, or of the same circle, may be
+correlated; readings of different points or circles are not. Its covariance Sigma is therefore
+sparse: up to the order of the readings it is block-diagonal, and each block has its own Cholesky
+factor. Whitening by ``W = L^-1``, so that ``W Sigma W' = I``, is cheap.
 """
 
 from __future__ import annotations

@@ -17,6 +17,18 @@ of the uniformly polarized other block, weighted with the deviations.
 
 `halbach_fe.solver.moments` is another method: it divides blocks into cells, integrates their
 interactions over both cells with kernels of its own, and solves for every cell.
+
+What blocks lose by the knee of their demagnetization curve changes that field too. Every block is
+divided into cells. A cell keeps the part ``tanh((h + h_c) / (2 w))`` of its remanence, for the
+component h of mu_0 H along the easy axis at the cell's middle; the width w puts the knee, where 0.9
+is left, at ``squareness`` times the coercivity h_c. The losses change the field that the other
+cells are in, so that a damped iteration repeats both until nothing changes. magpylib computes the
+fields, which are those of blocks in vacuum: losses of permeable blocks are not simulated.
+
+What is lost in layers thinner than a cell is missed, and the error falls with the square of the
+size of the cells. Losses in cells of two sizes are therefore extrapolated to none (Richardson), as
+the sum of those in the smaller cells, times more than 1, and in the larger ones, times a negative
+number.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A synthetic measurement campaign: block table, map, held-out map, and the truth.
+"""A synthetic measurement campaign: blocks drawn from the prior, their table, maps, and the truth.
 
 magpylib computes the field of the blocks in vacuum, and NGSolve the field that permeability and
 iron add; see `halbach_fe.synthetic.magpylib_field` and `halbach_fe.synthetic.reaction` for the

@@ -3,7 +3,7 @@
 Each body has its own axes: the origin is in its middle, x points radially outward through it, z is
 along the magnet's axis, and y is azimuthal (z cross x). These are the axes in which a coil measures
 its moment. Its shape may be seated in them at any angle. Angles are in rad, lengths in m,
-remanences in T.
+remanences in T. Iron has a material law, and is in tubes, prisms and balls in any place.
 """
 
 from __future__ import annotations

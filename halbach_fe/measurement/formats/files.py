@@ -1,4 +1,9 @@
-"""Import of field maps in foreign formats, and export to the formats of other programs."""
+"""Import of field maps in foreign formats, with the probe's calibration, and export to others.
+
+Makers of probes deliver a table of calibration with two columns for each sensor: fields, and the
+error of the reading in per cent of it, positive where the sensor reads too much. Readings are
+corrected before the axes of the probe are turned into those of the magnet, by linear interpolation.
+"""
 
 from __future__ import annotations
 
