@@ -72,11 +72,13 @@ from halbach_fe.diagnosis.naming import (
     named_effects,
     suspicions,
 )
-from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
-from halbach_fe.diagnosis.position_noise import (
+from halbach_fe.diagnosis.random_errors import (
+    Outlier,
     PositionNoise,
     estimate_position_noise,
+    excluding,
     have_settled,
+    outliers_of,
     with_position_noise,
 )
 from halbach_fe.diagnosis.result import (

@@ -19,8 +19,7 @@ from halbach_fe.diagnosis.marginal_evidence import (
     with_fewer_columns,
 )
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
-from halbach_fe.diagnosis.outliers import Outlier
-from halbach_fe.diagnosis.position_noise import PositionNoise
+from halbach_fe.diagnosis.random_errors import Outlier, PositionNoise
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map
 from halbach_fe.inference.result import InferenceResult

@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.map_errors import with_poses
 from halbach_fe.diagnosis.model_selection import Candidate
-from halbach_fe.diagnosis.position_noise import PositionNoise
+from halbach_fe.diagnosis.random_errors import PositionNoise
 from halbach_fe.diagnosis.result import (
     DetectionLimits,
     Diagnosis,

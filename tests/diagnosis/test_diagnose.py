@@ -16,7 +16,7 @@ from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Para
 from halbach_fe.diagnosis.effects.blocks import BlocksSwappedEffect
 from halbach_fe.diagnosis.map_errors import beside_amplitudes
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
-from halbach_fe.diagnosis.outliers import Outlier
+from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import possible

@@ -14,7 +14,7 @@ from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
-from halbach_fe.diagnosis.outliers import Outlier
+from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import (
     IdentifiedEffect,
     Imitation,

@@ -10,11 +10,14 @@ import scipy.sparse as sparse
 
 from halbach_fe.diagnosis.diagnose import vibration_beyond
 from halbach_fe.diagnosis.marginal_evidence import Marginal
-from halbach_fe.diagnosis.outliers import Outlier, excluding, find_outliers, outliers_of
-from halbach_fe.diagnosis.position_noise import (
+from halbach_fe.diagnosis.random_errors import (
+    Outlier,
     PositionNoise,
     estimate_position_noise,
+    excluding,
+    find_outliers,
     have_settled,
+    outliers_of,
     with_position_noise,
 )
 from halbach_fe.diagnosis.scene import Campaign
@@ -100,7 +103,7 @@ def test_several_outliers_side_by_side(root, clean, monkeypatch):
     clean[pairs] += OFF_T
     assert odd_ones(root, clean).tolist() == pairs
     assert len(odd_ones(root, crowded)) == 0
-    monkeypatch.setattr("halbach_fe.diagnosis.outliers.CROWD_PROBABILITY", 0.0)  # negative control
+    monkeypatch.setattr("halbach_fe.diagnosis.random_errors.CROWD_PROBABILITY", 0.0)  # negative control
     assert odd_ones(root, crowded).tolist() == crowd.tolist()
 
 
