@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import check_options, typed
+from halbach_fe.core.arrays import rms
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.installation import import_extra
@@ -204,7 +205,7 @@ def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
     enough = 200
     points = points[::max(1, len(points) // enough)]
     sigma = max(least_sigma_t, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
-    slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
+    slope = rms(gradient_of(magnet.blocks, points))
     stage = float(np.clip(sigma / slope if slope else np.inf, *stages_m))
     return replace(template, sigma_T=float(f"{sigma:.1g}"), position_sd_m=float(f"{stage:.1g}"))
 

@@ -108,6 +108,11 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
         raise TypeError("other than numbers; make a list or an array of them") from None
 
 
+def rms(values: Floats) -> float:
+    """Return the root of the mean square of numbers."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def of_length(vectors: Floats, length: Floats) -> Floats:
     """Return vectors (n, 3) along others, of given lengths (n,); along x where those are 0."""
     size = np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from scipy import linalg, special
 
-from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, rms, unit_circle
 from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.geometry.surface import is_in_plane
 
@@ -136,7 +136,7 @@ def sensor_errors(points: Floats, orders: int = 3, waves: int = 8) -> SmoothTerm
             for order in range(orders + 1):
                 for phase in (0.0, np.pi / 2)[:1 + (order > 0)]:
                     shape = along * np.cos(order * angle - phase)
-                    shape = shape / max(float(np.sqrt(np.mean(shape**2))), 1e-12)
+                    shape = shape / max(rms(shape), 1e-12)
                     for axis in np.eye(3):
                         found.append(np.sqrt(3) * shape[:, None] * axis)
                         fineness.append((order, wave))

@@ -26,7 +26,7 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import least_squares, minimize_scalar
 
-from halbach_fe.core.arrays import Floats, radii_of, unit_circle
+from halbach_fe.core.arrays import Floats, radii_of, rms, unit_circle
 from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError
 from halbach_fe.diagnosis.map_conventions import (
     ALL_AXES,
@@ -564,7 +564,7 @@ class _Search:
         difference = shown - scale * field
         residual = difference / sd
         return residual, _Misfit(
-            float(np.sqrt(np.mean(residual**2))),
+            rms(residual),
             float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole), float(scale))
 
     def of_measured_blocks(self, convention: MapConvention, nominal: Floats) -> Floats:

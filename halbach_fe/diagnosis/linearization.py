@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
@@ -279,7 +279,7 @@ def _solver_error(update: InferenceResult, campaign: Campaign) -> Floats:
     The solver's error is smooth, unlike noise. These fields are integrated out with the blocks, so
     that no effect is identified for a misfit that the solver's error can explain.
     """
-    size = float(np.sqrt(np.mean(update.response.error**2)))
+    size = rms(update.response.error)
     points = campaign.points_of(update.study)
     fields = fields_of_rms(harmonic_fields(points), size) if size else np.zeros((1, *points.shape))
     return campaign.seen(update.study, fields)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, rms
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects import catalogue
@@ -122,7 +122,7 @@ def _rms(
     residual = (update.readings - update.prediction_posterior.mean)[chosen]
     kinds = np.array(["".join(letter for letter in label if not letter.isdigit())
                       for label in update.observation.labels])[chosen]
-    return {kind: float(np.sqrt(np.mean(residual[kinds == kind]**2)))
+    return {kind: rms(residual[kinds == kind])
             for kind in dict.fromkeys(kinds.tolist())}
 
 

@@ -27,11 +27,12 @@ from halbach_fe.inference.instrument_fit import (
     readings_of_field,
     warn_of_bent_readings,
 )
-from halbach_fe.inference.overlap import left_out, overlaps
 from halbach_fe.inference.readings import (
     Noises,
     Readings,
     check_validation_map,
+    left_out,
+    overlaps,
     read_campaign,
     warn_of_another_gain,
 )

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, box_middle, spread
+from halbach_fe.core.arrays import Floats, box_middle, rms, spread
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
@@ -787,7 +787,7 @@ def _check_open_keys(magnet: Magnet, open_keys: Sequence[OpenKey]) -> None:
 
 def _probe_sd(sd: Floats) -> ProbePrior:
     """Return standard deviations (21,) of a probe's terms as those of their kinds."""
-    crosstalk, gain, offset, sensor = (float(np.sqrt(np.mean(part**2))) for part in np.split(
+    crosstalk, gain, offset, sensor = (rms(part) for part in np.split(
         sd, [6, OFFSETS.start, OFFSETS.stop]))
     return ProbePrior(crosstalk, gain, offset, sensor)
 

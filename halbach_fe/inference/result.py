@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import decimals, in_a_row
@@ -853,9 +853,9 @@ class InferenceResult(ShownInNotebook):
             unseen = part != TRAINING
             error = (self.readings - prediction.mean)[chosen]
             figures |= {
-                f"rms_error_{name}_T": float(np.sqrt(np.mean(error**2))),
+                f"rms_error_{name}_T": rms(error),
                 f"median_relative_error_{name}": float(np.median(finite)) if len(finite) else None,
-                f"rms_standardized_{name}": float(np.sqrt(np.mean(residuals**2))),
+                f"rms_standardized_{name}": rms(residuals),
                 f"coverage95_{name}": float(np.mean(residuals <= COVERAGE_Z)) if unseen else None,
                 f"chi2_{name}": float(
                     np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None}

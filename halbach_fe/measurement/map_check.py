@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints, spread
+from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
 from halbach_fe.core.pace import Pace, Progress
@@ -1305,7 +1305,7 @@ def _shown(
     sd, *sd_by_half = (float(np.sqrt(row @ covariance @ row)) for _, covariance in parts)
     values, sds = (np.reshape(each, (-1, 2)) for each in (by_half, sd_by_half))  # a pair a row
     alone = np.sqrt(np.maximum(sds**2 - sd**2, 0.1 * sds**2))
-    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if sds.size else 1.0
+    beyond = max(1.0, rms((values - value) / alone)) if sds.size else 1.0
     sees = SEEN * beyond * sds < abs(value)
     share = values / value if value else np.zeros(values.shape)
     off = (np.abs(values - value) > SEEN * sds) & ((share < alike[0]) | (share > alike[1]))

@@ -24,7 +24,7 @@ from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints, spread
+from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
@@ -687,7 +687,7 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
     # and of two components that agree, the third may have the opposite sign
     medians = np.median(np.abs(found.fun[:-3].reshape(-1, 3)), axis=0)
     off = float(MAD_TO_SD * np.sqrt(np.mean(medians**2)))
-    size = float(np.sqrt(np.mean(read**2))) / noise
+    size = rms(read) / noise
     odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
     if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:6]).max() > 0.3:
         odds = -np.inf  # it has left the place
@@ -920,7 +920,7 @@ class _Joined:
             count = 3 * int(shared.sum())
             limit = max(DISAGREES, float(special.chdtri(count, BY_CHANCE)) / count)
             left, left_alone = (
-                float(np.sqrt(np.mean((self.model.field - self.model.readings(fit))[shared]**2)))
+                rms((self.model.field - self.model.readings(fit))[shared])
                 for fit in (self.at, alone.at))
             found.append(Overlap(one.name, count, (both.chi2 - rest.chi2) / count, limit,
                                  left, left_alone))

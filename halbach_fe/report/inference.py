@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, rms
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
@@ -57,7 +57,6 @@ from halbach_fe.report.words import (
     place_of,
     ppm,
     relative,
-    rms,
     with_error,
     with_unit,
 )

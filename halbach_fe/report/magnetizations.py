@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, rms
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -22,7 +22,7 @@ from halbach_fe.report.page import (
     charts,
     legend_above,
 )
-from halbach_fe.report.words import best_known, capital, decimals, fraction, rms
+from halbach_fe.report.words import best_known, capital, decimals, fraction
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats, azimuths_of
+from halbach_fe.core.arrays import Floats, azimuths_of, rms
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument import prior_sd
@@ -35,7 +35,7 @@ from halbach_fe.report.page import (
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import counted, fraction, ppm, rms
+from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import Study
 
 NEARLY = 1.2

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, radii_of
+from halbach_fe.core.arrays import Floats, radii_of, rms
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
@@ -27,7 +27,7 @@ from halbach_fe.report.page import (
     Text,
     charts,
 )
-from halbach_fe.report.words import counted, fraction, p_value, rms, with_unit
+from halbach_fe.report.words import counted, fraction, p_value, with_unit
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees

@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL, first_of
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
@@ -85,11 +84,6 @@ def by_axis(name: str, values: Iterable[float], sd: Iterable[float]) -> dict[str
 def point_mm(values: Iterable[float], sd: Iterable[float]) -> str:
     """Return a point in m, with its standard deviations, in mm."""
     return f"({', '.join(by_axis('{}', values, sd).values())})"
-
-
-def rms(values: Floats) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def ppm(value: float) -> str:

@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import lpmv, roots_jacobi
 
-from halbach_fe.core.arrays import Bools, Floats, azimuths_of
+from halbach_fe.core.arrays import Bools, Floats, azimuths_of, rms
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -470,7 +470,7 @@ class HomogeneityModel:
         """Rms error bar of the solver for a component, relative to the nominal mean field."""
         field = self.field(self.response.nominal[:, None])[..., 0]
         mean = float(self.weights @ np.linalg.norm(field, axis=1))
-        return PPM * float(np.sqrt(np.mean(self.response.error**2))) / mean
+        return PPM * rms(self.response.error) / mean
 
     def of(self, parameters: Gaussian, seed: int = 0, measured: bool = False) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.

@@ -30,7 +30,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.integrate import quad_vec
 
-from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, rms, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -165,7 +165,7 @@ class Multipoles:
     @property
     def rms_of_mean(self) -> float:
         """Rms of `sizes`, in units."""
-        return float(np.sqrt(np.mean(self.sizes**2)))
+        return rms(self.sizes)
 
     def share_within(self, limit: float, normals: Floats) -> float:
         """Return the probability that all |c_n| are within a limit, from normals (count, 2 k)."""

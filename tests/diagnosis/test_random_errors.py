@@ -103,7 +103,8 @@ def test_several_outliers_side_by_side(root, clean, monkeypatch):
     clean[pairs] += OFF_T
     assert odd_ones(root, clean).tolist() == pairs
     assert len(odd_ones(root, crowded)) == 0
-    monkeypatch.setattr("halbach_fe.diagnosis.random_errors.CROWD_PROBABILITY", 0.0)  # negative control
+    # negative control
+    monkeypatch.setattr("halbach_fe.diagnosis.random_errors.CROWD_PROBABILITY", 0.0)
     assert odd_ones(root, crowded).tolist() == crowd.tolist()
 
 
