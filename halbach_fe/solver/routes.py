@@ -50,7 +50,6 @@ from halbach_fe.solver.separate_blocks import (
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.study.magnet import External
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -577,38 +576,3 @@ def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | N
     size = np.linalg.norm(external_field(magnet, points), axis=1).max()
     return (f"The field of `external`, up to {1e3 * size:.3g} mT at the points, is added as if the "
             f"iron of study {magnet.name} were not there. Iron may change it by as much as it is.")
-
-
-def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
-    """Return the derivative (n, 3) in T m/A of B along a block's nominal magnetization.
-
-    The iron is at its operating point in the nominal array.
-
-    Parameters
-    ----------
-    block : int
-        Number of the block, from 0.
-    points : ndarray, shape (n, 3), in m
-        Anywhere inside the outer boundary, also in magnet and iron.
-
-    Raises
-    ------
-    StudyError
-        If the array has no block of this number.
-    """
-    blocks = magnet.blocks
-    if not 0 <= block < len(blocks):
-        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)} "
-                         f"blocks; instead received number {block + 1}. Correct the number.")
-    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
-    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
-    direct = magnet.with_(solver__method="direct", solver__route="auto")
-    formulation = choose_route(direct, points).formulation(direct)
-    if magnet.is_nonlinear:
-        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
-    else:
-        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
-    size, changed = magnet.dimension, blocks[block]
-    # the change of remanence in T for a change of magnetization by 1 A/m along the easy axis
-    remanence = MU_0 * changed.recoil_tensor @ np.array(changed.easy_axis)
-    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

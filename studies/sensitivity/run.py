@@ -19,14 +19,16 @@ from sensitivity_page import Sensitivity, plan_rows
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import MU_0
 from halbach_fe.design.measurement_plan import plan_measurement
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_files
 from halbach_fe.report.plan import page, plan_summary
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.solver.routes import gateaux_derivative
+from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
+from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import read_study
@@ -36,6 +38,26 @@ BLOCK = 13
 """Slot of the paper's figure."""
 
 MAP_HALF_WIDTH_M, MAP_POINTS = 0.25, 201
+
+
+def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
+    """Derivative (n, 3) in T m/A of B along the nominal magnetization of a block, counted from 0.
+
+    The points (n, 3) in m may be in magnet and iron, which is at its operating point in the nominal
+    array.
+    """
+    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
+    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
+    direct = magnet.with_(solver__method="direct", solver__route="auto")
+    formulation = choose_route(direct, points).formulation(direct)
+    if magnet.is_nonlinear:
+        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
+    size, changed = magnet.dimension, magnet.blocks[block]
+    # the change of remanence in T for a change of magnetization by 1 A/m along the easy axis
+    remanence = MU_0 * changed.recoil_tensor @ np.array(changed.easy_axis)
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])
 
 
 def plane(study: Study, session: Session) -> tuple[Floats, Floats]:
