@@ -25,8 +25,14 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.moments.solve import reaction_columns, reaction_with_errors, solve_moments
-from tests.solver.moments.test_solve import around, errors_in_bars, ngsolve_reaction, three
+from halbach_fe.solver.moments.solve import reaction_columns, solve_moments
+from tests.solver.moments.test_solve import (
+    around,
+    errors_in_bars,
+    ngsolve_reaction,
+    reaction_with_errors,
+    three,
+)
 from tests.support.memory import own_peak
 
 SIDE, REMANENCE, PERMEABILITY = 0.012, 1.4, 1.05

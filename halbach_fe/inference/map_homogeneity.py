@@ -79,8 +79,7 @@ MAP, HELD_OUT_PART = "map", "map, held-out part"
 
 
 def map_homogeneity(
-    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], model: HomogeneityModel,
-    seed: int = 0,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], model: HomogeneityModel
 ) -> tuple[dict[str, Homogeneity], float, tuple[str, ...]]:
     """Return the homogeneity that a map has by itself, in the region of a model, and the misfit.
 
@@ -96,8 +95,6 @@ def map_homogeneity(
         The map, or all maps that the study lists.
     model : HomogeneityModel
         Of the region.
-    seed : int
-        Of the fields that are drawn for the error bars.
 
     Raises
     ------
@@ -116,7 +113,7 @@ def map_homogeneity(
     for name, chosen in parts.items():
         what = "The map" if name == MAP else "Its held-out part"
         known, noises[name], remark = _fitted(
-            readings, chosen, model, free, seed, maps, magnet.study)
+            readings, chosen, model, free, maps, magnet.study)
         if known is not None:
             found[name] = known
         if remark and (name == MAP or known is None):
@@ -182,7 +179,7 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
 
 def _fitted(
     readings: Readings, chosen: NDArray[np.bool_], model: HomogeneityModel, free_m: float,
-    seed: int, maps: Sequence[Map], study: Study,
+    maps: Sequence[Map], study: Study,
 ) -> tuple[Homogeneity | None, float, str]:
     """Return the homogeneity of the fit of some readings, and its noise over the stated noise.
 
@@ -210,7 +207,7 @@ def _fitted(
     terms = _terms(study, readings, maps, lambda at: (
         _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
     mean, noise, root = _with_terms(design, terms, scaled, fit)
-    normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
+    normals = np.random.default_rng(0).standard_normal((root.shape[1], DRAWS))
     every = np.column_stack([mean, mean[:, None] + root @ normals])
     points = (model.points[:len(model.weights)] - centre) / free_m
     told, main = _told(operator), model.nominal_mean

@@ -131,10 +131,10 @@ def elements_of(nodes: Floats, points: Floats) -> tuple[Ints, Ints, Floats, Ints
             np.vstack([reference for _, _, reference in hits]), missing)
 
 
-def probes_of(mesh: VerifiedMesh, cells: Ints, count: int = 10) -> tuple[Located, Floats]:
+def probes_of(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
     """Choose probes at which GetDP prints the field, to verify our evaluation.
 
-    There is one probe in each of up to ``count`` air elements, chosen from ``cells``, or from all
+    There is one probe in each of up to 10 air elements, chosen from ``cells``, or from all
     of air if these are not in air: in other materials the gradient of a scalar potential is not B.
     A probe lies inside its element, where B does not depend on a choice between neighbours, and off
     the element's planes of symmetry, where some shape functions or their derivatives vanish, so
@@ -150,7 +150,7 @@ def probes_of(mesh: VerifiedMesh, cells: Ints, count: int = 10) -> tuple[Located
     cells = cells[mesh.in_air[cells]]
     if not len(cells):
         cells = np.flatnonzero(mesh.in_air)
-    cells = cells[np.unique(np.linspace(0, len(cells) - 1, count).astype(int))]
+    cells = cells[np.unique(np.linspace(0, len(cells) - 1, 10).astype(int))]
     dimension = mesh.regions.dimension
     reference = np.tile(_PROBE[mesh.cell_type], (len(cells), 1))
     located = Located(cells, reference, sparse.eye_array(len(cells), format="csr"))

@@ -104,9 +104,9 @@ class ColumnName:
     """Text of the unit as the file spells it; may be empty."""
 
 
-def in_units(quantities: Sequence[str], length: str, field: str = "T") -> tuple[ColumnName, ...]:
+def in_units(quantities: Sequence[str], length: str) -> tuple[ColumnName, ...]:
     """Return columns that are named after their quantity: positions, and components of B."""
-    return tuple(ColumnName(name, name, field if name.startswith("B") else length)
+    return tuple(ColumnName(name, name, "T" if name.startswith("B") else length)
                  for name in quantities)
 
 

@@ -316,20 +316,6 @@ def _distances(cells: Cells, points: Floats) -> Floats:
     return np.asarray((distance / cells.radius[number]).min(axis=1))
 
 
-def reaction_with_errors(
-    blocks: Sequence[MagnetBlock], points: Floats, applied: Applied | None = None,
-    cells_per_side: int | None = None,
-) -> tuple[Floats, Floats]:
-    """Return the reaction (n, 3) in T of the blocks at points (n, 3) in m, and its bars (n, 1).
-
-    See `solve_moments` for the other arguments; fewer than two cells a side are not possible, since
-    half as many give the bars.
-    """
-    fine, coarse = (system.solve(applied) for system in refinement(blocks, cells_per_side))
-    field, error = field_with_errors(fine, coarse, points)
-    return field, np.linalg.norm(error, axis=1, keepdims=True)
-
-
 ENTRIES_AT_ONCE = 40_000_000
 """Largest number of readings times unknowns at a time, 320 MB."""
 
