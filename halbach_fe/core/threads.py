@@ -5,28 +5,53 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
+F = TypeVar("F", bound=Callable[..., Any])
 
-def compiled(function: Callable[..., Any], fastmath: bool = False) -> Any:
-    """Decorate a function that numba compiles; to import numba takes a second.
+
+class Compiled:
+    """A function that numba compiles when it is first called: to import numba takes a second.
 
     Threads run it side by side, since it releases the GIL; numba's own threads must not be entered
     from several Python threads.
     """
-    import numba
 
-    return numba.njit(cache=True, nogil=True, error_model="numpy",
-                      fastmath=fastmath or {"contract"})(function)
+    def __init__(self, function: Callable[..., Any], fastmath: bool = False) -> None:
+        self.function, self.fastmath = function, fastmath
+
+    def __call__(self, *values: Any) -> Any:
+        """Return what the function returns."""
+        return self.machine_code(*values)
+
+    @cached_property
+    def machine_code(self) -> Callable[..., Any]:
+        """The function for numba, which also has those that it calls under their names."""
+        import numba
+
+        code: Callable[..., Any] = numba.njit(
+            cache=True, nogil=True, error_model="numpy",
+            fastmath=self.fastmath or {"contract"})(self.function)
+        names = self.function.__globals__
+        for name in self.function.__code__.co_names:
+            if isinstance(called := names.get(name), Compiled):
+                names[name] = code if called is self else called.machine_code
+        return code
 
 
-reordered = partial(compiled, fastmath=True)
-"""The same for sums whose terms may be added in any order, several at a time."""
+def compiled(function: F) -> F:
+    """Decorate a function that numba compiles, see `Compiled`."""
+    return cast(F, Compiled(function))
+
+
+def reordered(function: F) -> F:
+    """Decorate a sum whose terms may be added in any order, several at a time."""
+    return cast(F, Compiled(function, fastmath=True))
 
 
 def in_threads(work: Callable[[int, int], object], shares: list[tuple[int, int]]) -> None:

@@ -37,7 +37,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
@@ -51,6 +50,7 @@ from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, rotation_matrix, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import along_edges, at_heights
+from halbach_fe.solver.axisymmetric_iron import IronReaction
 from halbach_fe.solver.coil_field import current_elements
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.iron_bodies import BodiesReaction
@@ -58,9 +58,6 @@ from halbach_fe.solver.separate_blocks import SeparateReaction, applies, solve_s
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
-
-if TYPE_CHECKING:
-    from halbach_fe.solver.axisymmetric_iron import IronReaction
 
 SMALL = 0.1
 """Forces smaller than this share of the largest one have the error that it would have: symmetry

@@ -23,9 +23,8 @@ next time; otherwise the region shrinks to a quarter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import pairwise
 from math import inf, pi, sin, sqrt
 from typing import Literal
@@ -151,18 +150,13 @@ def _best_pair(
     """
     paired = 10  # number of rings of each place, the best by themselves, that are tried in pairs
     options = np.argsort(single, axis=1)[:, :paired]
-    value, first, one, second, other = _pair_search()(
+    value, first, one, second, other = best_pair(
         rest, total, task.table, options, task.weights, task.objective == "rms",
         task.least_field_T, task.most_mass_kg, MISSES, TINY_T, PPM)
     return value, {first: one, second: other} if first >= 0 else {}
 
 
-@cache
-def _pair_search() -> Callable[..., tuple[float, int, int, int, int]]:
-    """Return `best_pair`, compiled when it is needed."""
-    return compiled(best_pair)
-
-
+@compiled
 def best_pair(
     rest: Floats, total: Floats, table: Floats, options: Ints, weights: Floats, is_rms: bool,
     least_field: float, most_mass: float, misses: float, tiny: float, ppm: float,

@@ -9,10 +9,10 @@ amplitudes have a normal prior of mean 0, whose width the evidence of the readin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import factorial
+from math import factorial, sqrt
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from halbach_fe.core.arrays import Floats, Ints, slices
-from halbach_fe.core.threads import in_threads, share_out
+from halbach_fe.core.threads import in_threads, reordered, share_out
 
 CLOSENESS = 0.45
 """Distance of charges from each other, relative to that from the region: where they are as far from
@@ -39,6 +39,67 @@ terms of two maps moved by up to 0.21 and 0.35 of their bars, with this by 0.06 
 
 UNIFORM = 1e3
 """Prior width of the uniform field in units of the charges' field: it is as good as free."""
+
+
+@reordered
+def _fields_of_charges(points: Floats, directions: Floats, places: Floats, scale: float,
+                       first: int, last: int, out: Floats) -> None:
+    """Write the component along ``directions`` (n, 3) of the field of every charge.
+
+    A charge of amplitude a at the place c has the field ``a R / |R|^3`` at the distance R = x - c.
+
+    ``out`` (n, k or more) is at points ``first`` to ``last`` of (n, 3) in m, for charges at
+    ``places`` (k, 3) in m whose amplitude is ``scale``.
+    """
+    px, py, pz = places[:, 0].copy(), places[:, 1].copy(), places[:, 2].copy()
+    for n in range(first, last):
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        u, v, w = scale * directions[n, 0], scale * directions[n, 1], scale * directions[n, 2]
+        row = out[n]
+        for k in range(len(px)):
+            x, y, z = a - px[k], b - py[k], c - pz[k]
+            square = x * x + y * y + z * z
+            row[k] = (x * u + y * v + z * w) / (square * sqrt(square))
+
+
+@reordered
+def _field_of_charges(points: Floats, places: Floats, amplitudes: Floats, first: int, last: int,
+                      out: Floats) -> None:
+    """Write the field (n, 3) of all charges at points ``first`` to ``last``."""
+    for n in range(first, last):
+        bx = by = bz = 0.0
+        for k in range(len(places)):
+            x, y, z = (points[n, 0] - places[k, 0], points[n, 1] - places[k, 1],
+                       points[n, 2] - places[k, 2])
+            square = x * x + y * y + z * z
+            weight = amplitudes[k] / (square * sqrt(square))
+            bx += weight * x
+            by += weight * y
+            bz += weight * z
+        out[n, 0], out[n, 1], out[n, 2] = bx, by, bz
+
+
+@reordered
+def _gradient_of_charges(points: Floats, places: Floats, amplitudes: Floats, first: int,
+                         last: int, out: Floats) -> None:
+    """Write the gradient (n, 3, 3) of the field of all charges at points ``first`` to ``last``."""
+    for n in range(first, last):
+        xx = yy = xy = xz = yz = 0.0
+        for k in range(len(places)):
+            x, y, z = (points[n, 0] - places[k, 0], points[n, 1] - places[k, 1],
+                       points[n, 2] - places[k, 2])
+            square = x * x + y * y + z * z
+            weight = amplitudes[k] / (square * sqrt(square))
+            more = 3 * weight / square
+            xx += weight - more * x * x
+            yy += weight - more * y * y
+            xy -= more * x * y
+            xz -= more * x * z
+            yz -= more * y * z
+        out[n, 0, 0], out[n, 1, 1], out[n, 2, 2] = xx, yy, -xx - yy
+        out[n, 0, 1] = out[n, 1, 0] = xy
+        out[n, 0, 2] = out[n, 2, 0] = xz
+        out[n, 1, 2] = out[n, 2, 1] = yz
 
 
 @dataclass(frozen=True)
@@ -87,15 +148,16 @@ class Charges:
     def fields_along(self, points: Floats, directions: Floats) -> Floats:
         """Return B . u (n, amplitudes) per amplitude at points (n, 3) in m, for u (n, 3)."""
         result = np.empty((len(points), len(self)))
-        self._compute("fields_along", points, np.ascontiguousarray(directions, float), self.places,
-                      self.scale, out=result)
+        self._compute(_fields_of_charges, points, np.ascontiguousarray(directions, float),
+                      self.places, self.scale, out=result)
         result[:, -3:] = UNIFORM * directions
         return result
 
     def field(self, points: Floats, amplitudes: Floats) -> Floats:
         """Return B (n, 3) in T at points (n, 3) in m for amplitudes (k,) in T."""
         result = np.empty((len(points), 3))
-        self._compute("field", points, self.places, self.scale * amplitudes[:-3], out=result)
+        self._compute(_field_of_charges, points, self.places, self.scale * amplitudes[:-3],
+                      out=result)
         return result + UNIFORM * amplitudes[-3:]
 
     def gradient(self, points: Floats, amplitudes: Floats) -> Floats:
@@ -104,18 +166,19 @@ class Charges:
         ``[i, c, j]`` is the derivative of component c along direction j.
         """
         result = np.empty((len(points), 3, 3))
-        self._compute("gradient", points, self.places, self.scale * amplitudes[:-3], out=result)
+        self._compute(_gradient_of_charges, points, self.places, self.scale * amplitudes[:-3],
+                      out=result)
         return result
 
-    def _compute(self, name: str, points: Floats, *values: Any, out: Floats) -> None:
-        """Call a function of `halbach_fe.measurement.charge_kernel` in threads."""
+    def _compute(
+        self, kernel: Callable[..., None], points: Floats, *values: Any, out: Floats
+    ) -> None:
+        """Call a compiled function in threads."""
         # Number of pairs of points and charges that a thread computes in some milliseconds, in
         # which many could be started.
         enough_for_a_thread = 500_000
-        from halbach_fe.measurement import charge_kernel  # imports numba
-
         points = np.ascontiguousarray(points, float)
-        in_threads(lambda first, last: getattr(charge_kernel, name)(
+        in_threads(lambda first, last: kernel(
             points, *values, first, last, out), share_out(
                 len(points), 1 + len(points) * len(self.places) // enough_for_a_thread))
 

@@ -26,7 +26,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -38,6 +38,9 @@ from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
+from halbach_fe.solver.moments.cells import Cells, cells_of
+from halbach_fe.solver.moments.interaction import Interaction
+from halbach_fe.solver.moments.solve import solve_moments
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
@@ -45,9 +48,6 @@ from halbach_fe.study.inference import Uncertain, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
-if TYPE_CHECKING:
-    from halbach_fe.solver.moments.cells import Cells
-    from halbach_fe.solver.moments.interaction import Interaction
 
 @dataclass(frozen=True)
 class Variations:
@@ -92,9 +92,6 @@ class Variations:
         cls, blocks: tuple[MagnetBlock, ...], sd: float, length_m: float, per_side: int
     ) -> Variations:
         """Return the variations of blocks with ``per_side`` cells along a side."""
-        from halbach_fe.solver.moments.cells import cells_of  # imports numba
-        from halbach_fe.solver.moments.interaction import Interaction
-
         cells = cells_of(blocks, per_side)
         starts = np.searchsorted(cells.block, np.arange(len(blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
@@ -436,8 +433,6 @@ class Deviations:
         if self.magnet.dimension == 2 or not any(
                 np.any(block.recoil_tensor != np.eye(3)) for block in blocks):
             return partial(self.field, deviations)
-        from halbach_fe.solver.moments.solve import solve_moments  # imports numba
-
         polarized = solve_moments(blocks, cells_per_side=1)
 
         def field(points: Floats) -> Floats:

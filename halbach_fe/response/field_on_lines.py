@@ -21,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +30,16 @@ from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.axisymmetric_iron import excess_of
+from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
+from halbach_fe.solver.iron_bodies import BodiesReaction
+from halbach_fe.solver.moments.solve import field_within
 from halbach_fe.solver.routes import check_plane, check_points, finite_element_part
 from halbach_fe.solver.separate_blocks import (
     SeparateReaction,
@@ -48,11 +50,6 @@ from halbach_fe.solver.separate_blocks import (
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.magnet import External
-
-if TYPE_CHECKING:
-    from halbach_fe.geometry.iron import IronSolid
-    from halbach_fe.solver.axisymmetric_iron import IronReaction
-    from halbach_fe.solver.iron_bodies import BodiesReaction
 
 
 @dataclass(frozen=True)
@@ -650,8 +647,6 @@ def _reaction(
 
     Both are (n, 3) in T; ``number`` (n,) is the block that a point is in, -1 in air.
     """
-    from halbach_fe.solver.moments.solve import field_within  # imports numba
-
     present = present_blocks(magnet.blocks)
     place = np.full(len(points), -1)  # number of the block of a point among those that are there
     for block in set(number[number >= 0]):

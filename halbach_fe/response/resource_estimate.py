@@ -38,6 +38,7 @@ from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
+from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.routes import Route, check_points, choose_route, finite_element_part
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
@@ -389,8 +390,6 @@ def _cost_of_moments(
 
     ``entries`` is the number of entries of H. Both results are 0 for other routes.
     """
-    from halbach_fe.solver.moments.interaction import Interaction  # import numba
-
     there = [magnet for magnet in magnets if not magnet.is_vacuum
              and choose_route(magnet, points) is Route.MOMENTS]
     found = [Interaction(cells_of(present_blocks(magnet.blocks),

@@ -42,6 +42,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, ring_radii
 from halbach_fe.solver.coil_field import coil_field
+from halbach_fe.solver.prism_kernel import arc_table, cuboid_fields, outline_fields
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
@@ -109,8 +110,6 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
 
     The order of the components is xx, yy, zz, xy, xz, yz.
     """
-    from halbach_fe.solver.prism_kernel import arc_table, cuboid_fields, outline_fields
-
     out = np.empty((len(points), 6))
     rectangle = _rectangle(block.outline)
     # number of points that a thread evaluates at a time: several milliseconds of work, beside which

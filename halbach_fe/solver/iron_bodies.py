@@ -57,6 +57,7 @@ from halbach_fe.solver.iron_modes import MESH, alone, assembled
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.solver.tetrahedra import DEEPEST, NEAR, add_field, sweep
 
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
@@ -105,8 +106,6 @@ class Surface:
 
         Points on a face of iron are too near, and those beside a round one may lie in the mesh.
         """
-        from halbach_fe.solver.tetrahedra import DEEPEST, NEAR  # imports numba
-
         resolved = NEAR / 2**DEEPEST  # distance over size of an element from which it is exact
 
         found = np.array(points)
@@ -327,8 +326,6 @@ class Tangent:
 
     def precondition(self, residual: Floats) -> Floats:
         """Return approximate solutions (n, c) by a sweep, the coarse level and a sweep back."""
-        from halbach_fe.solver.tetrahedra import sweep  # imports numba
-
         a, up = self.matrix, self.up
         found = np.zeros_like(residual)
         sweep(a.indptr, a.indices, a.data, residual, found, False)
@@ -442,8 +439,6 @@ def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
 
     On the surface it is that just outside, see `Surface.beside`.
     """
-    from halbach_fe.solver.tetrahedra import add_field
-
     reference, weights = QUADRATURE["tetra10"]
     values, _ = shape_functions("tetra10", reference)
     # the polarization in an element as a polynomial of second degree

@@ -14,7 +14,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,15 +30,26 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import FieldOfBlocks, external_field, unit_fields
+from halbach_fe.solver.iron_bodies import (
+    COARSER,
+    Asked,
+    BodiesReaction,
+    key_of,
+    size_of,
+    solve_bodies,
+)
 from halbach_fe.solver.iron_modes import Resolution, check_bodies
+from halbach_fe.solver.moments.interaction import Interaction
+from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
+from halbach_fe.solver.moments.solve import (
+    Moments,
+    System,
+    field_with_errors,
+    reaction_columns,
+    refinement,
+)
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
-
-if TYPE_CHECKING:
-    from halbach_fe.solver.iron_bodies import Asked, BodiesReaction
-    from halbach_fe.solver.moments.irreversible import KneeLaw
-    from halbach_fe.solver.moments.solve import Moments, System
-
 
 MANY_BLOCKS = 64
 """Number of blocks from which their field on the iron is summed by expansions."""
@@ -77,8 +88,6 @@ class SeparateReaction:
         """
         field, errors = np.zeros((len(points), 3)), [np.zeros((len(points), 3))]
         if self.blocks:
-            from halbach_fe.solver.moments.solve import field_with_errors
-
             fine, coarse = self.without_losses or self.blocks
             field, error = field_with_errors(fine, coarse, points)
             errors.append(error)
@@ -130,8 +139,6 @@ def solve_separate(
         return _reaction_without_iron(own)
     if magnet.iron_is_axisymmetric:
         return _reaction_with_iron(magnet, own, session, estimate)
-    from halbach_fe.solver.iron_bodies import Asked, key_of  # imports numba
-
     key = own, magnet.external, key_of(magnet, session, 1.0)
     return _latest(Asked(key, partial(_reaction_with_iron, magnet, own, session, estimate)))
 
@@ -197,8 +204,6 @@ def _solve_iron(
         resolution = replace(Resolution().coarser(1), modes=None) if rough else None
         return solve_iron(magnet.iron, source, session, magnet.name, resolution,
                           estimate, start)
-    from halbach_fe.solver.iron_bodies import COARSER, solve_bodies  # imports numba
-
     return solve_bodies(magnet, source, session, estimate, start, COARSER if rough else 1.0)
 
 
@@ -214,7 +219,6 @@ def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
         check_bodies(magnet.iron)
         return []
     from halbach_fe.geo.iron_bodies import check_apart  # imports Gmsh
-    from halbach_fe.solver.iron_bodies import COARSER, size_of
 
     check_apart(magnet.name, magnet.iron)
     rough = estimate or _permeable(magnet.blocks)
@@ -261,8 +265,6 @@ def separate_columns(
         Takes the number of a block, from 0, and indices (k,) of points or a slice; returns the
         reaction (k, 3, 3) in T per T of remanence along each axis.
     """
-    from halbach_fe.solver.moments.solve import reaction_columns  # imports numba
-
     blocks = magnet.blocks
     of_blocks = reaction_columns(
         blocks, points, progress=progress) if _permeable(blocks) else None
@@ -299,9 +301,6 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
             edge.arc for block in blocks for edge in block.outline) or any(
             block.gradient or block.corner_loss for block in blocks):
         return FieldOfBlocks(blocks)
-    from halbach_fe.solver.moments.interaction import Interaction  # import numba
-    from halbach_fe.solver.moments.solve import System
-
     system = System.of(blocks, cells_per_side=1, divisions=4)
     cells = system.interaction.cells
     interaction = Interaction(cells, opening=0.4, reading_degree=8)
@@ -352,8 +351,6 @@ class _Blocks:
         """Return those of a magnet."""
         law, material = None, magnet.study.demagnetization
         if magnet.has_losses and material is not None:
-            from halbach_fe.solver.moments.irreversible import KneeLaw  # imports numba
-
             law = KneeLaw.of(material)
         return cls(present_blocks(magnet.blocks), law, magnet.study.prior.variation_sd > 0,
                    magnet.study.mesh.cells_per_side, sizes)
@@ -362,8 +359,6 @@ class _Blocks:
         """Return the blocks in cells, see `refinement`; none where nothing reacts."""
         if not _permeable(self.blocks) and self.law is None:
             return ()
-        from halbach_fe.solver.moments.solve import refinement  # imports numba
-
         return refinement(self.blocks, self.cells_per_side)[:self.sizes]
 
     def reaction(
@@ -393,8 +388,6 @@ class _Blocks:
         """
         if self.law is None:
             return system.solve(applied)
-        from halbach_fe.solver.moments.irreversible import solve_irreversible
-
         return solve_irreversible(system, self.law, applied, by_mean=by_mean)[0]
 
 

@@ -16,6 +16,7 @@ neglected field is mu_r - 1 times the change that the displacement makes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.installation import import_extra
-from halbach_fe.core.threads import in_threads, share_out
+from halbach_fe.core.threads import in_threads, reordered, share_out
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
 from halbach_fe.synthetic.true_magnet import (
@@ -133,19 +134,58 @@ def _response(magnet: TrueMagnet, mesh: Any, potential: Any, points: Floats
             np.vstack([one.reshape(-1, size) for _, one in parts]))
 
 
+@reordered
+def _field_of_lines(points: Floats, places: Floats, moments: Floats, first: int, last: int,
+                    out: Floats) -> None:
+    """Write 2 pi B (n, 2) of lines of dipoles at points ``first`` to ``last`` of (n, 2) in m.
+
+    ``places`` (2, m) in m and ``moments`` (2, m) have a row per axis.
+    """
+    for n in range(first, last):
+        bx = by = 0.0
+        for k in range(places.shape[1]):
+            x, y = points[n, 0] - places[0, k], points[n, 1] - places[1, k]
+            inverse = 1 / (x * x + y * y)
+            along = 2 * (x * moments[0, k] + y * moments[1, k]) * inverse
+            bx += (along * x - moments[0, k]) * inverse
+            by += (along * y - moments[1, k]) * inverse
+        out[n, 0], out[n, 1] = bx, by
+
+
+@reordered
+def _field_of_dipoles(points: Floats, places: Floats, moments: Floats, first: int, last: int,
+                      out: Floats) -> None:
+    """Write 4 pi B (n, 3) of dipoles at points ``first`` to ``last`` of (n, 3) in m.
+
+    ``places`` (3, m) in m and ``moments`` (3, m) have a row per axis.
+    """
+    for n in range(first, last):
+        bx = by = bz = 0.0
+        for k in range(places.shape[1]):
+            x, y, z = (points[n, 0] - places[0, k], points[n, 1] - places[1, k],
+                       points[n, 2] - places[2, k])
+            square = 1 / (x * x + y * y + z * z)
+            cube = square * sqrt(square)
+            along = 3 * square * (x * moments[0, k] + y * moments[1, k] + z * moments[2, k])
+            bx += (along * x - moments[0, k]) * cube
+            by += (along * y - moments[1, k]) * cube
+            bz += (along * z - moments[2, k]) * cube
+        out[n, 0], out[n, 1], out[n, 2] = bx, by, bz
+
+
 def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
     """Return B (n, d) in T of dipoles at points (n, d) in m.
 
     ``places`` (m, d) in m are the positions of the dipoles, ``moments`` (m, d) mu_0 times their
-    moments in T m^d. In two dimensions they are lines of dipoles.
+    moments in T m^d. In two dimensions they are lines of dipoles. Source: J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., equation 5.56; in two dimensions the same integrated along z.
     """
-    from halbach_fe.synthetic import dipole_kernel  # imports numba
-
     size = points.shape[1]
-    kernel = {2: dipole_kernel.field_2d, 3: dipole_kernel.field_3d}[size]
-    points, *rows = (np.ascontiguousarray(each, float) for each in (points, places.T, moments.T))
+    kernel = {2: _field_of_lines, 3: _field_of_dipoles}[size]
+    points, places, moments = (
+        np.ascontiguousarray(each, float) for each in (points, places.T, moments.T))
     field = np.empty_like(points)
-    in_threads(lambda first, last: kernel(points, *rows, first, last, field),
+    in_threads(lambda first, last: kernel(points, places, moments, first, last, field),
                share_out(len(points)))
     return field / (2 * np.pi * (size - 1))
 

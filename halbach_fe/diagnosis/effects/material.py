@@ -20,6 +20,8 @@ from halbach_fe.diagnosis.effects.base import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.moments.cells import cells_of
+from halbach_fe.solver.moments.irreversible import KneeLaw
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.magnet import MOST_SQUARE, Demagnetization
@@ -262,9 +264,6 @@ def _mean_losses(study: Study, places: Sequence[Place]) -> Floats:
     """Return the change of the mean polarization of every block (places, 3 blocks) in T, if each is
     in the field of the intact blocks in vacuum.
     """
-    from halbach_fe.solver.moments.cells import cells_of  # imports numba
-    from halbach_fe.solver.moments.irreversible import KneeLaw
-
     blocks = build_magnet(study).blocks
     # Gauss nodes per direction and block at which the field is computed for the cheap estimate
     nodes = 3
