@@ -206,7 +206,7 @@ def held_back_in_words(blocks: Sequence[Term], measured: bool) -> str:
 
 
 def words_of(name: str) -> tuple[str, str]:
-    """Return the words and the SI unit of a term of `instrument_terms.NAMES`, or of a stage.
+    """Return the words and the SI unit of a term of `instrument.NAMES`, or of a stage.
 
     A probe of |B| has terms without an axis: ``gain``, ``offset_T``, ``drift_T``.
     The name of a map, stage or probe may stand before it: ``fringe.gain_x``.

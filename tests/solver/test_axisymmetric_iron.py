@@ -14,10 +14,11 @@ from halbach_fe.solver import iron_modes
 from halbach_fe.solver.axisymmetric_iron import coupled_modes, solve_iron, to_angles, to_modes
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.iron_modes import Resolution, grid_lines, iron_cells
-from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction
 from halbach_fe.synthetic.true_magnet import FroehlichLaw
+from tests.oracles.sectors import bore_field
 
 IRON = {"initial": 200.0, "saturation": 1.0}
 CURVE = froehlich_kennelly(**IRON)

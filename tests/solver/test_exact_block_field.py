@@ -18,9 +18,10 @@ from halbach_fe.solver.exact_block_field import (
     unit_fields,
 )
 from halbach_fe.solver.prism_kernel import arc_table
-from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
+from tests.oracles.sectors import bore_field
 
 MAGPYLIB_ERROR = 1e-6
 """magpylib's cylinder segments carry about 2e-8 of the remanence near the axis; ours changes by

@@ -11,9 +11,10 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.magnetostatics import edge_elements, solve_sources
-from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.solver.routes import solve_nominal
 from tests.conftest import circle
+from tests.oracles.sectors import bore_field
 
 SECTORS = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors
 from halbach_fe.study.array import check_order
+from tests.oracles.sectors import bore_field
 
 INNER, OUTER, RADIUS = 1.0, 1.5, 0.1
 ORDERS, NUMBERS = range(1, 13), range(4, 17)
