@@ -445,10 +445,3 @@ def prism_field(vertices: Floats, half: float, cuboid: bool, x: float, y: float,
     if cuboid:
         return cuboid_field(vertices[2, 0], vertices[2, 1], half, x, y, z)
     return polygon_field(vertices, half, x, y, z)
-
-
-@compiled
-def fields_at(vertices: Floats, half: float, cuboid: bool, points: Floats, out: Floats) -> None:
-    """Write the field matrix (n, 6) of a prism at points (n, 3) of its frame into ``out``."""
-    for i in range(len(points)):
-        out[i] = prism_field(vertices, half, cuboid, points[i, 0], points[i, 1], points[i, 2])

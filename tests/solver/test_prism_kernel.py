@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.solver.exact_block_field import matrix_of
-from halbach_fe.solver.prism_kernel import arc_table, fields_at, outline_fields
+from halbach_fe.solver.prism_kernel import arc_table, outline_fields, prism_field
 from tests.solver.moments.bodies import OUTLINES, block, cuboid_matrix
 
 ROUNDING = 1e-13
@@ -21,9 +21,8 @@ RECTANGLE = np.array([[-6, -5], [6, -5], [6, 5], [-6, 5]]) * 1e-3
 
 
 def field(vertices, half, points, cuboid=False):
-    found = np.empty((len(points), 6))
-    fields_at(np.ascontiguousarray(vertices), half, cuboid, np.ascontiguousarray(points), found)
-    return matrix_of(found)
+    vertices = np.ascontiguousarray(vertices)
+    return matrix_of(np.array([prism_field(vertices, half, cuboid, *point) for point in points]))
 
 
 def by_outline(vertices, half, points):
