@@ -68,10 +68,10 @@ def sphere() -> tuple[dict[str, Any], Floats, Truth]:
     return study, points, truth
 
 
-def by_ngsolve(size_m: float) -> Truth:
-    """Return the truth with elements of a size, of order 3."""
+def by_ngsolve(size_m: float, mirrored: tuple[int, int, int] = (0, 0, 0)) -> Truth:
+    """Return the truth with elements of a size, of order 3, of what is not ``mirrored``."""
     return lambda magnet, points: reaction_field(
-        magnet_of(magnet.study), points, Elements(size=size_m, order=3))
+        magnet_of(magnet.study), points, Elements(size=size_m, order=3, mirrored=mirrored))
 
 
 def back_plate() -> tuple[dict[str, Any], Floats, Truth]:
@@ -162,7 +162,7 @@ def undulator() -> tuple[dict[str, Any], Floats, Truth]:
              "repeats": 6, "step_m": [0.0, 0.0, 0.02], "mirrored": ["y"]}]}, 0.02, 1.8)
     points = np.array([[x, y, z] for x in (0.0, 0.005) for y in (-0.004, 0.0, 0.004)
                        for z in np.linspace(-0.03, 0.03, 13)])
-    return study, points, by_ngsolve(0.005)
+    return study, points, by_ngsolve(0.003, (1, -1, -1))
 
 
 CASES = {"sphere": sphere, "plates": plates_on_cubes, "quadrupole": quadrupole, "c_yoke": c_yoke,
