@@ -30,7 +30,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.pose_space import right_angles
+from halbach_fe.inference.pose_search import right_angles
 from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.map_check import MapCheck, check_map

@@ -19,8 +19,7 @@ from halbach_fe.response.nonlinear import nonlinear_model
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
-from halbach_fe.stats.noise import independent_noise
+from halbach_fe.stats.gaussian import Gaussian, independent_noise, nominal_prior
 from halbach_fe.stats.pcn import Posterior, Proposal, assess_convergence, prior_reference, sample
 from halbach_fe.study.reader import read_study
 

@@ -26,7 +26,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.iron import FroehlichLaw, law_of
+from halbach_fe.synthetic.true_magnet import FroehlichLaw, law_of
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 from tests.support.memory import Weighed, own_peak
 

@@ -159,7 +159,7 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
 
 def _calibration(parser: argparse.ArgumentParser) -> None:
     """Add --calibration."""
-    from halbach_fe.measurement.calibration import HEADER
+    from halbach_fe.measurement.formats.files import HEADER
 
     option("--calibration", input_file, "TABLE",
            "CSV file with the errors of the probe's sensors against a reference, "
@@ -182,10 +182,9 @@ def import_map(arguments: argparse.Namespace) -> int:
     """
     import numpy as np
 
-    from halbach_fe.measurement.calibration import read_calibration
     from halbach_fe.measurement.field_map import refuse_total_field
     from halbach_fe.measurement.formats.declared import DeclaredFormat
-    from halbach_fe.measurement.formats.files import import_map
+    from halbach_fe.measurement.formats.files import import_map, read_calibration
 
     common.own_file(arguments, arguments.file, *filter(None, [arguments.calibration]))
     imported = import_map(arguments.file, declared(arguments, DeclaredFormat), arguments.format)
@@ -337,7 +336,7 @@ def export(arguments: argparse.Namespace) -> int:
     With the format blocks, the input is a study, and the file a table of free blocks (CSV or HDF5):
     all blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
     """
-    from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
+    from halbach_fe.geometry.array_layout import beside_blocks, blocks_table
     from halbach_fe.measurement.formats.files import export_map
     from halbach_fe.study.free_blocks_file import write_free_blocks
 

@@ -124,7 +124,7 @@ def check(arguments: argparse.Namespace) -> int:
             page = map_check.joined_page(named, hf.join_maps(
                 named, say, show, arguments.turn_rad or TURN_RAD))
         elif is_total_field(maps[0]):
-            from halbach_fe.measurement.total_check import check_total
+            from halbach_fe.measurement.suspect_rows import check_total
 
             page = map_check.total_page(maps[0], check_total(maps[0]))
         else:
@@ -247,7 +247,7 @@ def _run_campaign(
 ) -> int:
     """Register all maps that the study lists, each with a page in a folder of its own."""
     from halbach_fe.core.files import make_folder
-    from halbach_fe.inference.campaign_registration import register_maps, registered_study
+    from halbach_fe.inference.registration import register_maps, registered_study
     from halbach_fe.measurement.campaign import maps_of
     from halbach_fe.measurement.map_join import read_joined
     from halbach_fe.report.page import write_changed_study, write_files

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from halbach_fe.cli.guard import say, show
-from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import EXIT_CODES, MAX_QUOTED, printable
 from halbach_fe.core.files import InputFile
+from halbach_fe.core.installation import version
 from halbach_fe.core.numbers import HIGHEST_ORDER, LIMIT_PPM, LIMIT_UNITS
 from halbach_fe.measurement.formats.declared import DELIMITERS, FORMATS, UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.units import (

@@ -23,8 +23,8 @@ from halbach_fe.cli.guard import show
 from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, choice, option, path, verb
 from halbach_fe.cli.options import VERBS as VERBS
 from halbach_fe.cli.options import parser as parser
-from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
+from halbach_fe.core.installation import version
 
 if TYPE_CHECKING:
     from halbach_fe.solver.getdp import GetDP

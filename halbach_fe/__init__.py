@@ -142,7 +142,7 @@ __all__ = list(_HOME)
 def __getattr__(name: str) -> Any:
     """Import a name of the interface when it is first used."""
     if name == "__version__":
-        from halbach_fe.core.code_digest import version
+        from halbach_fe.core.installation import version
 
         return version("halbach-fe")
     if name not in _HOME:

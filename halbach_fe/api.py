@@ -42,7 +42,7 @@ from halbach_fe.diagnosis import diagnose as diagnosis_room
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
+from halbach_fe.geometry.array_layout import beside_blocks, blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import MAP, map_homogeneity, of_other_size

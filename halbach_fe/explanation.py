@@ -24,7 +24,7 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import directed, is_total_field, is_undirected, taking_arrays
 from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
-from halbach_fe.measurement.total_check import check_total
+from halbach_fe.measurement.suspect_rows import check_total
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import answer as answer_of_check

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arguments import check_options, typed
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
+from halbach_fe.core.installation import import_extra
 from halbach_fe.core.numbers import check_number
-from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.result_folder import single_file
-from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_outline
+from halbach_fe.geometry.array_layout import beside_blocks, blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.positions import points_from

@@ -79,7 +79,7 @@ LONGEST = [
 
 QUICK = {
     "cli": "completion dry_run explain export formats new",
-    "core": "code_digest hdf5 pace result_folder",
+    "core": "hdf5 installation pace result_folder",
     "design": "cad tolerance",
     "diagnosis": "discriminating_measurements marginal_evidence smooth_discrepancy",
     "docs": "describe_your_magnet figures",

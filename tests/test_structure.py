@@ -24,7 +24,7 @@ MOST_ROOMS = 12
 # What a library may be imported by: a room, or a module of it.
 ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
            "numba": "core.threads",
-           # extras, which only `core.optional_packages.import_extra` imports, when they are needed
+           # extras, which only `core.installation.import_extra` imports, when they are needed
            "magpylib": "", "ngsolve": "", "netgen": ""}
 
 # Statistics see arrays only; the closed form is an oracle; and a synthetic campaign tests the model
@@ -32,8 +32,7 @@ ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
 MAY_IMPORT = {
     "stats": ("core",), "solver.ring_harmonics_2d": ("core",),
     "synthetic": ("core", "study", "measurement.field_map", "measurement.block_table",
-                  "measurement.positions", "measurement.reading_noise",
-                  "measurement.scan_lines")}
+                  "measurement.positions", "measurement.reading_noise")}
 
 
 def imports(path):

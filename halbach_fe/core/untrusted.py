@@ -32,7 +32,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.core.files import atomic
-from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.installation import import_extra
 
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""

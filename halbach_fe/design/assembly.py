@@ -15,8 +15,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
+from halbach_fe.geometry.array_layout import blocks_of_table, blocks_table
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
-from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import at_heights

@@ -38,8 +38,7 @@ from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns, jo
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.measurement.campaign import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import sensor_matrix, sensor_positions
-from halbach_fe.measurement.instrument_terms import seen
+from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points

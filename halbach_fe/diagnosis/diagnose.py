@@ -38,7 +38,6 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, NotConvergedError
 from halbach_fe.core.pace import Pace, Say, quiet
-from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.flexible_causes import Family
@@ -102,7 +101,7 @@ from halbach_fe.diagnosis.search import (
     with_short_steps,
 )
 from halbach_fe.diagnosis.summary import place_in_words
-from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
+from halbach_fe.diagnosis.uncertain_effects import detection_limits, with_uncertain_effects
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult

@@ -39,12 +39,12 @@ from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
-from halbach_fe.measurement.scan_lines import motion
+from halbach_fe.measurement.positions import motion
 from halbach_fe.response.block_variation import Deviations, vacuum_changes
 from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.noise import NoiseCovariance, independent_noise
+from halbach_fe.stats.gaussian import NoiseCovariance, independent_noise
 from halbach_fe.study.inference import PROBE_KEYS
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

@@ -23,7 +23,7 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.mesh import with_rough_mesh
 from halbach_fe.solver.routes import iron_change, solve_nominal
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.study.model import FIELD_KEYS, Study
 
 Signatures = dict[tuple[str, Place], Floats]

@@ -32,8 +32,7 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.result import FoundPose, IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.inference.campaign_registration import register_maps, registered_study
-from halbach_fe.inference.registration import odds, register
+from halbach_fe.inference.registration import odds, register, register_maps, registered_study
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data, maps_of

@@ -59,7 +59,7 @@ class NominalFields:
     """Whether the map is of |B| alone."""
     way: Floats | None = field(default=None, kw_only=True)
     """Unit vectors along which the stage came to each point, see
-    `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its order.
+    `halbach_fe.measurement.positions.motion`; None if the points are all of a map, in its order.
     Shape (n, 3)."""
     _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 

@@ -24,7 +24,7 @@ from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
 from halbach_fe.measurement.observation import TOTAL
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.study.inference import ExcludedReading, Inference
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS

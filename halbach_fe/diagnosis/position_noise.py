@@ -25,7 +25,7 @@ from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIO
 from halbach_fe.diagnosis.scene import Campaign, ScannedMap
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.reading_noise import readings_per_displacement
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
 from halbach_fe.study.model import Study
 

@@ -32,7 +32,7 @@ from halbach_fe.measurement.instrument import (
     probe_points,
     sensor_matrix,
 )
-from halbach_fe.measurement.scan_lines import follows_times
+from halbach_fe.measurement.positions import follows_times
 from halbach_fe.study.inference import POSE_KEYS, PROBE_KEYS
 from halbach_fe.study.model import Study
 

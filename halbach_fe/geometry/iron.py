@@ -11,9 +11,9 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Bools, Floats, polygon_area
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.geometry.array_layout import counter_clockwise
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
-from halbach_fe.geometry.free_blocks import counter_clockwise
 from halbach_fe.geometry.outline import Outline, along_edges, closed_outline
 from halbach_fe.geometry.surface import (
     Contact,

@@ -18,11 +18,14 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import MeasuredPrior, prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
     Beside,
+    Magnitudes,
     OpenTerms,
     amplitude_columns,
+    bent,
     joined,
     of_the_first,
     readings_of_field,
+    warn_of_bent_readings,
 )
 from halbach_fe.inference.overlap import left_out, overlaps
 from halbach_fe.inference.readings import (
@@ -39,7 +42,6 @@ from halbach_fe.inference.result import (
     MapPose,
     Prediction,
 )
-from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.field_map import points_of, taking_arrays
@@ -63,11 +65,10 @@ from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.linear_gaussian import Rows, predict
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
-from halbach_fe.study.uncertain import Uncertain
 
 ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.code_digest import code_digest
 from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.installation import code_digest
 from halbach_fe.core.untrusted import read_hdf5, with_checksum
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction

@@ -17,11 +17,10 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.readings import Readings
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, LeftOut, Overlap, Stretch
-from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.linear_gaussian import Rows
-from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.types import COMPONENTS
 
 NEAR = 0.87

@@ -25,13 +25,13 @@ from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, m
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
-from halbach_fe.inference.pose_search import NARROW
-from halbach_fe.inference.pose_space import (
+from halbach_fe.inference.pose_search import (
     LONGEST_M,
     LONGEST_RAD,
+    NARROW,
     Field,
+    line_of,
     moved_by,
     right_angles,
     share_of,
@@ -49,13 +49,6 @@ from halbach_fe.measurement.doubted_terms import (
 )
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
-    in_si_and_magnet_axes,
-    remove_nonlinear_part,
-    sensor_matrix,
-    sensor_positions,
-    total_without_nonlinear_part,
-)
-from halbach_fe.measurement.instrument_terms import (
     DIFFERENCE_M,
     NAMES,
     POSE,
@@ -63,8 +56,13 @@ from halbach_fe.measurement.instrument_terms import (
     STEADY,
     by_terms,
     field_at_sensors,
+    in_si_and_magnet_axes,
+    remove_nonlinear_part,
     seen,
+    sensor_matrix,
+    sensor_positions,
     sensors_apart,
+    total_without_nonlinear_part,
     with_terms,
 )
 from halbach_fe.measurement.observation import (

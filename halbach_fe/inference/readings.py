@@ -45,8 +45,8 @@ from halbach_fe.measurement.observation import (
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.response.matrix import Response, StoredMatrix
 from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.stats.linear_gaussian import row_slices
-from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
 

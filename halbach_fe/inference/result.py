@@ -43,11 +43,10 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.inference import shifted
 from halbach_fe.study.model import Study
-from halbach_fe.study.uncertain import shifted
 
 ALL_READINGS = "all"
 """Name of the only region of a study without noise regions."""
@@ -388,7 +387,7 @@ class InferenceResult(ShownInNotebook):
     terms : InstrumentTerms or None
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
     amplitudes : Amplitudes or None
-        Uncertain amplitudes of the study, see `halbach_fe.study.uncertain.Uncertain`; None if there
+        Uncertain amplitudes of the study, see `halbach_fe.study.inference.Uncertain`; None if there
         are none.
     overlaps : tuple of Overlap
         How maps agree where they overlap.

@@ -28,7 +28,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
-from halbach_fe.measurement.scan_lines import follows_times
+from halbach_fe.measurement.positions import follows_times
 from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T

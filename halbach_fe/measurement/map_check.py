@@ -40,6 +40,13 @@ from halbach_fe.measurement.field_map import (
     warn_of_millimetres,
 )
 from halbach_fe.measurement.harmonic_field import NO_FIT, Charges, HarmonicFit, spacing_of
+from halbach_fe.measurement.positions import (
+    HELD_OUT_EVERY,
+    held_out_lines,
+    motion,
+    point_spacing,
+    scan_lines,
+)
 from halbach_fe.measurement.probe_in_field import (
     COARSE_WAVES,
     FEW_ITERATIONS,
@@ -56,13 +63,6 @@ from halbach_fe.measurement.probe_in_field import (
     ProbeModel,
     fit_probe,
     scatter_of,
-)
-from halbach_fe.measurement.scan_lines import (
-    HELD_OUT_EVERY,
-    held_out_lines,
-    motion,
-    point_spacing,
-    scan_lines,
 )
 from halbach_fe.measurement.suspect_rows import (
     at_border,

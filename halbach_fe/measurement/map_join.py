@@ -61,6 +61,7 @@ from halbach_fe.measurement.map_check import (
     selected,
     some_lines,
 )
+from halbach_fe.measurement.positions import scan_lines
 from halbach_fe.measurement.probe_in_field import (
     LAG,
     MATRICES,
@@ -72,7 +73,6 @@ from halbach_fe.measurement.probe_in_field import (
     State,
     fit_probe,
 )
-from halbach_fe.measurement.scan_lines import scan_lines
 from halbach_fe.study.types import COMPONENTS
 
 FEWEST_SHARED = 40

@@ -19,7 +19,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import by_stated_units, sensor_model
-from halbach_fe.measurement.scan_lines import held_out_lines, scan_lines
+from halbach_fe.measurement.positions import held_out_lines, scan_lines
 from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCoefficients
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS

@@ -17,7 +17,7 @@ from halbach_fe.measurement.field_map import TOTAL_SIGMA_COLUMN, is_total_field
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix
 from halbach_fe.measurement.observation import TOTAL, Observation
 from halbach_fe.solver.exact_block_field import gradient_of
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
 
 ROUNDING = 1e-12

@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import label_in_words, place_in_words, rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
-from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.report.diagnosis_answer import catalogue_titles, title_of
 from halbach_fe.report.page import (
     MEASURED,

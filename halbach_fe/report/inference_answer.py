@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
-from halbach_fe.inference.campaign_registration import moved_by_turns
+from halbach_fe.inference.registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer, along_the_axis
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words

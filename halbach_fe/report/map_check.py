@@ -23,8 +23,8 @@ from halbach_fe.measurement.map_check import (
     oriented,
 )
 from halbach_fe.measurement.map_join import JoinedMaps
-from halbach_fe.measurement.scan_lines import is_sorted
-from halbach_fe.measurement.total_check import TotalCheck
+from halbach_fe.measurement.positions import is_sorted
+from halbach_fe.measurement.suspect_rows import TotalCheck
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.instrument_terms import prior_sd
+from halbach_fe.measurement.instrument import prior_sd
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,

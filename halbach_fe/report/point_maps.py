@@ -24,7 +24,7 @@ from halbach_fe.inference.result import (
     Prediction,
 )
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,

@@ -13,12 +13,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import block_images
-from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
     UNDECIDED_LOG_EVIDENCE,
     axes_of_map,
+    moved_by_turns,
     nearest_right_angles,
     odds,
     turn_from_axes,
@@ -41,12 +41,14 @@ from halbach_fe.measurement.field_map import (
     write_map,
 )
 from halbach_fe.measurement.instrument import (
+    CROSSTALK,
+    PROBE,
+    STEADY,
     in_si_and_magnet_axes,
     probe_points,
     row_order_note,
     turn_of,
 )
-from halbach_fe.measurement.instrument_terms import CROSSTALK, PROBE, STEADY
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,

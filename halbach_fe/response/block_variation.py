@@ -8,7 +8,7 @@ the prior. Amplitudes are in prior standard deviations. The field is that of sma
 the block in vacuum. What permeable blocks answer to it is neglected, some 5 % of a variation that
 is small itself.
 
-An uncertain amplitude (`halbach_fe.study.uncertain.Uncertain`) is a parameter of the magnet after
+An uncertain amplitude (`halbach_fe.study.inference.Uncertain`) is a parameter of the magnet after
 its magnetizations, in units of its prior standard deviation. The magnetization is always that of
 the blocks: if an amplitude changes what blocks are expected to have (a temperature), it is a
 deviation that they share in the prior, and its own column has only what the amplitude changes at
@@ -41,9 +41,9 @@ from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
+from halbach_fe.study.inference import Uncertain, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
-from halbach_fe.study.uncertain import Uncertain, shifted
 
 if TYPE_CHECKING:
     from halbach_fe.solver.moments.cells import Cells

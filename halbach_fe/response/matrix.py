@@ -25,9 +25,9 @@ import xarray as xr
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.code_digest import code_digest, version
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
+from halbach_fe.core.installation import code_digest, version
 from halbach_fe.core.untrusted import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
@@ -48,8 +48,8 @@ from halbach_fe.solver.routes import (
     vacuum_part,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Rows
 from halbach_fe.stats.linear_gaussian import row_slices
-from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import FIELD_KEYS
 

@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.code_digest import version
 from halbach_fe.core.files import write_text
+from halbach_fe.core.installation import version
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet

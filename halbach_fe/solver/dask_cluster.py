@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from halbach_fe.core.errors import GetDPError, HalbachError, SchedulerError
-from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.installation import import_extra
 from halbach_fe.core.pace import Say, quiet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Job

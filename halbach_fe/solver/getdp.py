@@ -29,7 +29,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, GetDPNotFoundError, HalbachError, OutputError
 from halbach_fe.core.files import is_full
-from halbach_fe.core.optional_packages import install_command
+from halbach_fe.core.installation import install_command
 
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
 LOG_NAME = "getdp.log"

@@ -41,9 +41,9 @@ from numpy.typing import NDArray
 
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, radii_of
-from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.files import make_folder
+from halbach_fe.core.installation import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns, read_matrix, read_saved, read_solutions, read_unknowns

@@ -29,8 +29,13 @@ import scipy.linalg as linalg
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints, slices
-from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import (
+    CovarianceFactor,
+    Gaussian,
+    NoiseCovariance,
+    root_matrix,
+    stacked_root,
+)
 
 READINGS_AT_ONCE = 2048
 """Largest number of rows that are whitened at a time, so that memory does not grow with the number

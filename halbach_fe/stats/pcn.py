@@ -30,8 +30,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import SamplingError
-from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 
 Model = Callable[[Floats], Floats]
 """Maps parameters (m,) to readings (n,)."""

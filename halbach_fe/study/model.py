@@ -30,13 +30,14 @@ from halbach_fe.study.inference import (
     MapSettings,
     Plan,
     Prior,
+    Uncertain,
+    check_uncertain,
 )
 from halbach_fe.study.iron import Iron, IronCurve, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MIN_LENGTH_M, Length, Lines, StudyModel
-from halbach_fe.study.uncertain import Uncertain, check_uncertain
 
 MAGNET_KEYS = {"dimension", "array", "iron_ring", "iron"}
 """Keys of a study that describe its magnet: blocks and iron."""

@@ -20,7 +20,6 @@ from halbach_fe.study.array import Array, Block, BlockException
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.iron import iron_of_study
 from halbach_fe.synthetic.shapes import (
     CylinderBody,
     PolygonBody,
@@ -29,7 +28,14 @@ from halbach_fe.synthetic.shapes import (
     Shape,
     shoelace,
 )
-from halbach_fe.synthetic.true_magnet import Body, BodyPart, TrueMagnet, VacuumNeighbour, vector
+from halbach_fe.synthetic.true_magnet import (
+    Body,
+    BodyPart,
+    TrueMagnet,
+    VacuumNeighbour,
+    iron_of_study,
+    vector,
+)
 
 
 def free_bodies(array: Array, dimension: int) -> tuple[Body, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.measurement.scan_lines import motion
+from halbach_fe.measurement.positions import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
 from halbach_fe.synthetic.shapes import Vector

@@ -24,12 +24,20 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
-from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.installation import import_extra
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.iron import Ball, FroehlichLaw, IronLaw, Pole, TableLaw, Tube
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
-from halbach_fe.synthetic.true_magnet import Body, TrueMagnet
+from halbach_fe.synthetic.true_magnet import (
+    Ball,
+    Body,
+    FroehlichLaw,
+    IronLaw,
+    Pole,
+    TableLaw,
+    TrueMagnet,
+    Tube,
+)
 
 MAX_STEPS = 40
 """Largest number of steps of Newton's method."""

@@ -41,8 +41,7 @@ from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
 from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
-from halbach_fe.stats.noise import NoiseCovariance, independent_noise
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, independent_noise, nominal_prior
 from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
 from halbach_fe.stats.small_samples import Sampler, Simulator, ranks, uniformity
 from halbach_fe.study.materials import MU_0

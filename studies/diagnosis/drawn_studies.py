@@ -13,9 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.optional_packages import import_extra
-from halbach_fe.measurement.positions import points_from
-from halbach_fe.measurement.scan_lines import goes_both_ways, motion
+from halbach_fe.core.installation import import_extra
+from halbach_fe.measurement.positions import goes_both_ways, motion, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.cli.verbs import VERBS
-from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
+from halbach_fe.core.installation import version
 from halbach_fe.magnets import WRITTEN
 from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT

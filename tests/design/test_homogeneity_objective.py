@@ -31,9 +31,8 @@ from halbach_fe.response.multipoles import MultipoleReference
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
 from halbach_fe.synthetic.magpylib_field import vacuum_field
-from halbach_fe.synthetic.simulate import simulate_campaign
+from halbach_fe.synthetic.simulate import coil_table, draw_magnet, simulate_campaign
 from tests.conftest import changed
 from tests.support.moved_blocks import moved
 from tests.support.pages import page

@@ -25,9 +25,8 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
 from halbach_fe.synthetic.magpylib_field import vacuum_field
-from halbach_fe.synthetic.simulate import simulate_campaign, true_field
+from halbach_fe.synthetic.simulate import coil_table, draw_magnet, simulate_campaign, true_field
 from tests.conftest import DIPOLE, changed
 from tests.support.moved_blocks import moved, unturned
 

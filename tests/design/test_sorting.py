@@ -16,7 +16,7 @@ from halbach_fe.report.sorting import answer
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
+from halbach_fe.synthetic.simulate import coil_table, draw_magnet
 from tests.design.test_shimming import ORDERS, RADIUS, SQUARES, chi2, study_of, true_multipoles
 
 CUBES = SQUARES | {"prior": {"types": {"a": list(range(1, 13))}, "common_mode_sd": 0.005}}

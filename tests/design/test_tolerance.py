@@ -14,7 +14,7 @@ from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import draw_magnet
+from halbach_fe.synthetic.simulate import draw_magnet
 from tests.design.test_shimming import ORDERS, RADIUS, study_of, true_multipoles
 
 PRIOR = {"magnitude_sd": 0.01, "direction_sd_deg": 0.5, "common_mode_sd": 0.005,

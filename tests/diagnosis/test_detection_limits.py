@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.diagnosis.detection_limits import smallest_amplitude
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
 from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors
 from halbach_fe.diagnosis.summary import limits_in_words
+from halbach_fe.diagnosis.uncertain_effects import smallest_amplitude
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.solver.exact_block_field import field_of

@@ -30,8 +30,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
-from halbach_fe.measurement.instrument_terms import NAMES
+from halbach_fe.measurement.instrument import NAMES, nonlinear_part, sensor_model
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import Instrument

@@ -21,8 +21,8 @@ from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.knee_losses import _cells, lost_field, with_knee_losses
 from halbach_fe.synthetic.magpylib_field import vacuum_field
+from halbach_fe.synthetic.reaction import _cells, lost_field, with_knee_losses
 from tests.conftest import circle
 from tests.diagnosis.campaign import DOCUMENT, NOISE_T, drawn, field
 

@@ -18,7 +18,7 @@ from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import row_order_note, sensor_positions
-from halbach_fe.measurement.scan_lines import follows_times, goes_both_ways, motion
+from halbach_fe.measurement.positions import follows_times, goes_both_ways, motion
 from halbach_fe.report.diagnosis import page as page_of_diagnosis
 from halbach_fe.report.inference import page as page_of_update
 from halbach_fe.study.measurement import Instrument

@@ -22,7 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.campaign import ONLY_MAP
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.solver.exact_block_field import gradient_of, unit_fields
-from halbach_fe.stats.noise import independent_noise
+from halbach_fe.stats.gaussian import independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 from tests.diagnosis.campaign import DOCUMENT, NOISE_T, STUDY

@@ -27,9 +27,9 @@ from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.response.block_variation import shared_deviations
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.inference import number_changes, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
-from halbach_fe.study.uncertain import number_changes, shifted
 from tests.conftest import circle
 from tests.diagnosis.campaign import drawn, field, table_of
 from tests.support.cuboids import DOCUMENT, NOISE_T

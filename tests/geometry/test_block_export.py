@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.free_blocks import blocks_table
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from halbach_fe.geometry.array_layout import sector_outline
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.convex_pieces import Shape, annulus
-from halbach_fe.geometry.free_blocks import sector_outline
 from halbach_fe.geometry.outline import closed_outline, outline_contains
 
 

@@ -13,8 +13,8 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.array_layout import sector_outline
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
-from halbach_fe.geometry.free_blocks import sector_outline
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_iron, overlapping_blocks

@@ -19,8 +19,8 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import infer as infer_module
-from halbach_fe.inference.campaign_registration import contradictions
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.registration import contradictions
 from halbach_fe.inference.storage import inference_summary
 from halbach_fe.measurement.campaign import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map

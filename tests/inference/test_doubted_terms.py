@@ -54,8 +54,7 @@ from halbach_fe.measurement.field_map import (
     undirected,
     write_map,
 )
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes
-from halbach_fe.measurement.instrument_terms import NAMES
+from halbach_fe.measurement.instrument import NAMES, in_si_and_magnet_axes
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.report.diagnosis_answer import answer as diagnosis_answer
 from halbach_fe.report.inference_answer import answer as inference_answer

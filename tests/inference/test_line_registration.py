@@ -12,8 +12,8 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior
+from halbach_fe.inference.pose_search import line_of
 from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.report.registration import answer, by_hypothesis, sentences

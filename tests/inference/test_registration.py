@@ -17,13 +17,13 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import pose_fit
-from halbach_fe.inference.campaign_registration import _of_known_probe
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, ProbePrior
 from halbach_fe.inference.pose_search import _after_no_pose, coarse_poses, right_angles
 from halbach_fe.inference.registration import (
     UNDECIDED_LOG_EVIDENCE,
+    _of_known_probe,
     axes_of_map,
     least_turned_first,
     odds,
@@ -32,7 +32,7 @@ from halbach_fe.inference.registration import (
 )
 from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.measurement.instrument_terms import NAMES
+from halbach_fe.measurement.instrument import NAMES
 from halbach_fe.report.registration import (
     AT_REST,
     NOT_AT_REST,

@@ -20,9 +20,14 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import matrix as response_module
 from halbach_fe.response.matrix import StoredMatrix, response_matrix
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
+from halbach_fe.stats.gaussian import (
+    CovarianceFactor,
+    Gaussian,
+    NoiseCovariance,
+    independent_noise,
+    nominal_prior,
+)
 from halbach_fe.stats.linear_gaussian import update, whitened
-from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.oracles.cuboids import cuboid_field, long_dipole
 from tests.support.pages import write_result

@@ -31,8 +31,8 @@ from halbach_fe.measurement.formats.files import export_map, import_map
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.instrument import map_time, remove_nonlinear_part
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
+from halbach_fe.measurement.positions import held_out_lines, is_sorted, motion
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
-from halbach_fe.measurement.scan_lines import held_out_lines, is_sorted, motion
 from halbach_fe.measurement.suspect_rows import broken_rows, neighbours, rough_rows, stands_out
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import (

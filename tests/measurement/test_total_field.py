@@ -28,8 +28,7 @@ from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import export_map, import_map
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.measurement.suspect_rows import contradicted_rows
-from halbach_fe.measurement.total_check import check_total
+from halbach_fe.measurement.suspect_rows import check_total, contradicted_rows
 from halbach_fe.report.map_check import total_answer
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study

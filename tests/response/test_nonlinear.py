@@ -44,8 +44,8 @@ from halbach_fe.study.materials import ConstitutiveLaw
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.iron import law_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
+from halbach_fe.synthetic.true_magnet import law_of
 from tests.conftest import DIPOLE, changed, circle
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 

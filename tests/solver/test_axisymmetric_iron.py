@@ -17,7 +17,7 @@ from halbach_fe.solver.iron_modes import Resolution, grid_lines, iron_cells
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction
-from halbach_fe.synthetic.iron import FroehlichLaw
+from halbach_fe.synthetic.true_magnet import FroehlichLaw
 
 IRON = {"initial": 200.0, "saturation": 1.0}
 CURVE = froehlich_kennelly(**IRON)

@@ -8,9 +8,14 @@ from scipy import stats
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, by_readings_alone, largest_directions, nominal_prior
+from halbach_fe.stats.gaussian import (
+    Gaussian,
+    by_readings_alone,
+    independent_noise,
+    largest_directions,
+    nominal_prior,
+)
 from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
-from halbach_fe.stats.noise import independent_noise
 
 
 def textbook(matrix, readings, noise, prior):

@@ -10,9 +10,8 @@ import scipy.sparse as sparse
 from scipy import stats
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, independent_noise
 from halbach_fe.stats.linear_gaussian import update, whitened
-from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.stats.pcn import Posterior, laplace
 
 

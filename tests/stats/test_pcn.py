@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import SamplingError
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, independent_noise
 from halbach_fe.stats.linear_gaussian import update
-from halbach_fe.stats.noise import independent_noise
 from halbach_fe.stats.pcn import (
     ConvergenceDiagnostics,
     Posterior,

@@ -25,8 +25,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import draw_magnet
-from halbach_fe.synthetic.simulate import true_field
+from halbach_fe.synthetic.simulate import draw_magnet, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 WEAK = 0.03

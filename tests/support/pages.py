@@ -7,7 +7,7 @@ import json
 import re
 from html.parser import HTMLParser
 
-from halbach_fe.core.code_digest import version
+from halbach_fe.core.installation import version
 from halbach_fe.report.answer import PAGE_RECORD, Answer
 from halbach_fe.report.page import Page, Section, Table, page_of, write_files, write_page
 

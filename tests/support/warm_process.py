@@ -19,7 +19,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
-from halbach_fe.core.code_digest import code_digest
+from halbach_fe.core.installation import code_digest
 from halbach_fe.report import page
 from halbach_fe.response import matrix
 

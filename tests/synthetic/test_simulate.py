@@ -25,9 +25,14 @@ from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
 from halbach_fe.synthetic.reaction import lone_moment_matrix
-from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
+from halbach_fe.synthetic.simulate import (
+    coil_table,
+    draw_magnet,
+    real_places,
+    simulate_campaign,
+    write_campaign,
+)
 from tests.conftest import DIPOLE, changed
 from tests.support.pages import page
 

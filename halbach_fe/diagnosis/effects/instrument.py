@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place
-from halbach_fe.measurement.scan_lines import goes_both_ways
+from halbach_fe.measurement.positions import goes_both_ways
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS

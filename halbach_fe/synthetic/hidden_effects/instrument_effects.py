@@ -26,8 +26,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     parameters,
     signed_log_uniform,
 )
-from halbach_fe.synthetic.iron import Ball
-from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
+from halbach_fe.synthetic.true_magnet import Ball, Body, TrueMagnet, vector
 
 Apply = Callable[..., FaultyInstrument]
 """Function of an instrument, the site and the values that returns the instrument with them."""

@@ -24,15 +24,17 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     parameters,
     signed_log_uniform,
 )
-from halbach_fe.synthetic.iron import FroehlichLaw, TrueIron, Tube
-from halbach_fe.synthetic.knee_losses import with_knee_losses
+from halbach_fe.synthetic.reaction import with_knee_losses
 from halbach_fe.synthetic.shapes import PrismBody, SectorBody
 from halbach_fe.synthetic.true_magnet import (
     Body,
     BodyPart,
+    FroehlichLaw,
     MagnetCopy,
     SoftSphere,
+    TrueIron,
     TrueMagnet,
+    Tube,
     vector,
 )
 

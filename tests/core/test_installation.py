@@ -1,13 +1,20 @@
-"""What is stored is computed again when a formula that it came from has changed, and only then."""
+"""What is stored is computed again when a formula that it came from has changed, and only then.
+
+What is missing is installed from where halbach-fe itself came from.
+"""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from importlib import metadata
+from types import SimpleNamespace
 
 import pytest
 
-from halbach_fe.core.code_digest import sources
+from halbach_fe.core.errors import ExtraMissingError
+from halbach_fe.core.installation import import_extra, install_command, sources
 
 MODEL = {
     "toy/__init__.py": "",
@@ -28,7 +35,7 @@ MODEL = {
 def digest(folder):
     """The digest in a process of its own, as imports are remembered."""
     return subprocess.run(
-        [sys.executable, "-c", "from halbach_fe.core.code_digest import code_digest\n"
+        [sys.executable, "-c", "from halbach_fe.core.installation import code_digest\n"
          "print(code_digest('toy.matrix').hex())"],
         cwd=folder, check=True, capture_output=True, text=True).stdout
 
@@ -63,3 +70,32 @@ def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
 def test_chains_depend_on_the_sampler_too():
     names = {path.name for path in sources("halbach_fe.inference.mcmc")}
     assert {"pcn.py", "nonlinear.py", "matrix.py", "magnetostatics_2d.pro"} <= names
+
+
+ORIGINS = {  # what pip wrote of the installation (PEP 610), and the command that adds an extra
+    "index": (None, "pip install 'halbach-fe[campaign]'"),
+    "clone": ({"url": "file:///home/a%20b/halbach-fe", "dir_info": {"editable": True}},
+              "pip install -e '/home/a b/halbach-fe[campaign]'"),
+    "folder": ({"url": "file:///src/halbach-fe", "dir_info": {}},
+               "pip install '/src/halbach-fe[campaign]'"),
+    "wheel": ({"url": "file:///w/halbach_fe-1.0.0-py3-none-any.whl", "archive_info": {}},
+              "pip install 'halbach-fe[campaign] @ file:///w/halbach_fe-1.0.0-py3-none-any.whl'"),
+    "repository": ({"url": "https://host/x.git", "vcs_info": {"vcs": "git", "commit_id": "1"}},
+                   "pip install 'halbach-fe[campaign] @ git+https://host/x.git'"),
+}
+
+
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_the_command_names_the_place_of_the_installation(origin, monkeypatch):
+    written, command = ORIGINS[origin]
+    records = {"direct_url.json": json.dumps(written)} if written else {}
+    monkeypatch.setattr(metadata, "distributions", lambda name: [
+        SimpleNamespace(read_text={}.get), SimpleNamespace(read_text=records.get)])
+    assert install_command("campaign") == command
+
+
+def test_a_package_that_is_not_installed(monkeypatch):
+    """One sentence says what it is for, and how to install it."""
+    monkeypatch.setitem(sys.modules, "magpylib", None)
+    with pytest.raises(ExtraMissingError, match=r"Simulated .*: pip install .*\[campaign"):
+        import_extra("magpylib")

@@ -1,8 +1,9 @@
-"""A digest of the program's own source code, which reveals results that older code computed.
+"""What is installed: a digest of the program's own source code, versions of packages, and extras.
 
-A response matrix or a Markov chain that an earlier version of a formula computed must not be
-reused. The files that a result depends on are found from the import statements themselves, so that
-no hand-written list of folders can go out of date. The versions of other packages are here too.
+The digest reveals results that older code computed. A response matrix or a Markov chain that an
+earlier version of a formula computed must not be reused. The files that a result depends on are
+found from the import statements themselves, so that no hand-written list of folders can go out of
+date. Extras are optional packages; an error names the command that installs them.
 """
 
 from __future__ import annotations
@@ -10,9 +11,14 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import json
 from functools import cache, lru_cache
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from halbach_fe.core.errors import ExtraMissingError
 
 
 @lru_cache(maxsize=8)
@@ -24,7 +30,7 @@ def code_digest(module: str) -> bytes:
 
     Examples
     --------
-    >>> len(code_digest("halbach_fe.core.code_digest"))
+    >>> len(code_digest("halbach_fe.core.installation"))
     32
     """
     digest = hashlib.sha256()
@@ -99,3 +105,40 @@ def _imported(path: Path, name: str) -> tuple[str, ...]:
 def version(package: str) -> str:
     """Return the version of an installed package, read once: its metadata take 5 ms to parse."""
     return metadata.version(package)
+
+
+_CAMPAIGN = "Simulated campaigns, and magnets of magpylib, need magpylib and NGSolve"
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to halbach-fe from where it was installed (PEP 610).
+
+    A clone or a wheel is named by its own place: an index of packages may not hold it.
+    """
+    # a folder of sources on the path has records of its own, without the place
+    records = (one.read_text("direct_url.json") for one in metadata.distributions(
+        name="halbach-fe"))
+    origin = json.loads(next(filter(None, records), "{}"))
+    url = origin.get("url", "")
+    if "dir_info" in origin:
+        editable = "-e " if origin["dir_info"].get("editable") else ""
+        return f"pip install {editable}'{unquote(urlsplit(url).path)}[{extra}]'"
+    if "vcs_info" in origin:
+        url = f"{origin['vcs_info']['vcs']}+{url}"
+    return f"pip install 'halbach-fe[{extra}]{' @ ' if url else ''}{url}'"
+
+
+def import_extra(module: str, extra: str = "campaign", purpose: str = _CAMPAIGN) -> Any:
+    """Import a module of an optional extra by its name; `purpose` begins the error's sentence.
+
+    Raises
+    ------
+    ExtraMissingError
+        If the module, or one that it needs, is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ExtraMissingError(
+            f"{purpose}, but {error.name or module} cannot be imported here. Install what is "
+            f"missing: {install_command(extra)}") from None
