@@ -286,19 +286,10 @@ def _polarized(
 
 def _densities(magnet: Magnet, given: float | None) -> Floats:
     """Return the density of every block that is there, in kg/m^3."""
-    array, table = magnet.array, magnet.array.free_blocks
-    first = len(magnet.blocks) - (len(table) if table else 0)
-    of_ring = {ring: array.ring[ring - 1].material if array.ring else None
-               for ring in range(1, array.rings + 1)}
-    found = []
-    for number, block in enumerate(magnet.blocks):
-        if not present_blocks((block,)):
-            continue
-        name = (table.value("material", number - first) if table and number >= first
-                else of_ring[block.ring]) or array.material
-        found.append(given or (np.mean(grade(str(name)).density_kg_per_m3) if name
-                               else DENSITY_KG_PER_M3))
-    return np.array(found)
+    return np.array([
+        given or (np.mean(grade(name).density_kg_per_m3) if name else DENSITY_KG_PER_M3)
+        for block, name in zip(magnet.blocks, magnet.materials, strict=True)
+        if present_blocks((block,))])
 
 
 def _converged(

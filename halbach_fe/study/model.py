@@ -21,7 +21,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
-from halbach_fe.study.grades import STRENGTHS, grade_of
+from halbach_fe.study.grades import STRENGTHS, grade, grade_of
 from halbach_fe.study.inference import (
     POSE_KEYS,
     PROBE_KEYS,
@@ -294,6 +294,32 @@ class Study(StudyModel, metaclass=_OfKeys):
             own_name(name): value for name, value in each.change.items()
             if value and own_name(name)})]
         return type(self).model_validate(values | own | {"maps": (), "uncertain": uncertain})
+
+    def demagnetization_of(self, material: str | None) -> Demagnetization:
+        """Return what blocks of a grade withstand, by the name of the grade.
+
+        Numbers that the table states otherwise than the grade of the array hold for all blocks.
+
+        Raises
+        ------
+        StudyError
+            If there is no table, or the grade lacks a number, or differs in what no table can hold.
+        """
+        table, of_array = self.demagnetization, grade_of(self.array)
+        if table is None:
+            raise StudyError(must_be("`demagnetization`", f"study {self.name}",
+                                     "what the material withstands", "nothing"))
+        if of_array is None or material in (None, of_array.name):
+            return table
+        own = grade(str(material)).demagnetization_defaults
+        of_grade = [key for key, value in of_array.demagnetization_defaults.items()
+                    if getattr(table, key) == value]
+        if missing := [key for key in of_grade if key not in own]:
+            raise StudyError(must_be(
+                f"`demagnetization.{missing[0]}`", f"study {self.name}", "given otherwise than "
+                f"that of {of_array.name}, to hold for all blocks", "that of this grade alone, "
+                f"while others are of {material}, of which it is not known"))
+        return table.with_(**{key: own[key] for key in of_grade})
 
     @property
     def uncertain_of_magnet(self) -> tuple[Uncertain, ...]:
