@@ -2,7 +2,7 @@
 
 The bars are those of every reading. NGSolve meshes blocks and iron together, of symmetric magnets a
 part, and shares no code with the field that it judges. Its elements are of order 4: of order 3 and
-4 to 5 mm it was 7e-3 of the main field off in the quadrupole and 3e-3 between the plates, as much as
+4 mm it was 7e-3 of the main field off in the quadrupole and 3e-3 between the plates, as much as
 what was judged.
 """
 
