@@ -1,7 +1,9 @@
 """Iron of any shape: against closed forms, NGSolve, and the measured plates of TEAM problem 13.
 
-The bars are those of every reading. NGSolve meshes blocks and iron together with curved elements of
-order 3, and shares no code with the field that it judges.
+The bars are those of every reading. NGSolve meshes blocks and iron together, of symmetric magnets a
+part, and shares no code with the field that it judges. Its elements are of order 4: of order 3 and
+4 mm it was 7e-3 of the main field off in the quadrupole and 3e-3 between the plates, as much as
+what was judged.
 """
 
 from __future__ import annotations
@@ -68,10 +70,10 @@ def sphere() -> tuple[dict[str, Any], Floats, Truth]:
     return study, points, truth
 
 
-def by_ngsolve(size_m: float) -> Truth:
-    """Return the truth with elements of a size, of order 3."""
+def by_ngsolve(size_m: float, order: int = 3, mirrored: tuple[int, int, int] = (0, 0, 0)) -> Truth:
+    """Return the truth with elements of a size and order, of what is not ``mirrored``."""
     return lambda magnet, points: reaction_field(
-        magnet_of(magnet.study), points, Elements(size=size_m, order=3))
+        magnet_of(magnet.study), points, Elements(size=size_m, order=order, mirrored=mirrored))
 
 
 def back_plate() -> tuple[dict[str, Any], Floats, Truth]:
@@ -88,7 +90,7 @@ def back_plate() -> tuple[dict[str, Any], Floats, Truth]:
         0.01, 1.5)
     points = np.array([[x, y, z] for x in np.linspace(-0.024, 0.024, 9) for y in (0.008, 0.012)
                        for z in (0.0, 0.004)])
-    return study, points, by_ngsolve(0.0025)
+    return study, points, by_ngsolve(0.0018, 4, (1, 0, 1))
 
 
 def c_yoke() -> tuple[dict[str, Any], Floats, Truth]:
@@ -107,7 +109,7 @@ def c_yoke() -> tuple[dict[str, Any], Floats, Truth]:
         {"kind": "prism", "outline_m": outline, "length_m": 0.024}]}, 0.02, 1.6)
     points = np.array([[x, y, z] for x in (-0.008, -0.003, 0.003, 0.008)
                        for y in (-0.006, 0.0, 0.006) for z in (-0.008, 0.0, 0.008)])
-    return study, points, by_ngsolve(0.0045)
+    return study, points, by_ngsolve(0.0031, 4, (0, -1, 1))
 
 
 def cuboids(middles_m: Floats, sizes_m: Floats | list[float], remanences_T: Floats,
@@ -135,7 +137,7 @@ def quadrupole() -> tuple[dict[str, Any], Floats, Truth]:
     angles = np.pi / 16 + np.pi / 8 * np.arange(16)
     points = np.array([[r * np.cos(phi), r * np.sin(phi), z] for r in (0.004, 0.008)
                        for z in (0.0, 0.01) for phi in angles])
-    return study, points, by_ngsolve(0.0042)
+    return study, points, by_ngsolve(0.0021, 4, (-1, -1, 1))
 
 
 def plates_on_cubes() -> tuple[dict[str, Any], Floats, Truth]:
@@ -147,7 +149,7 @@ def plates_on_cubes() -> tuple[dict[str, Any], Floats, Truth]:
              "mirrored": ["y"]}]}, 0.02, 1.4)
     points = np.array([[x, y, z] for x in (-0.016, -0.005, 0.005, 0.016)
                        for y in (-0.018, -0.009, 0.0, 0.009, 0.018) for z in (0.0, 0.01)])
-    return study, points, by_ngsolve(0.0042)
+    return study, points, by_ngsolve(0.0021, 4, (1, -1, 1))
 
 
 def undulator() -> tuple[dict[str, Any], Floats, Truth]:
@@ -162,7 +164,7 @@ def undulator() -> tuple[dict[str, Any], Floats, Truth]:
              "repeats": 6, "step_m": [0.0, 0.0, 0.02], "mirrored": ["y"]}]}, 0.02, 1.8)
     points = np.array([[x, y, z] for x in (0.0, 0.005) for y in (-0.004, 0.0, 0.004)
                        for z in np.linspace(-0.03, 0.03, 13)])
-    return study, points, by_ngsolve(0.005)
+    return study, points, by_ngsolve(0.0042, 4, (1, -1, -1))
 
 
 CASES = {"sphere": sphere, "plates": plates_on_cubes, "quadrupole": quadrupole, "c_yoke": c_yoke,
@@ -246,7 +248,7 @@ def compare(note: Note, cases: dict[str, Callable[[], tuple[dict[str, Any], Floa
             f"{np.sqrt(np.mean(bar**2) / np.mean(error**2)):.1f}, {seconds:.0f} s of processor")
         note(f"iron_any.error_{name}", worst[name], "of the main field",
              f"largest at {len(points)} points; "
-             + ("closed form" if name == "sphere" else "NGSolve, curved, order 3"))
+             + ("closed form" if name == "sphere" else "NGSolve, curved, order 4"))
         if name != "sphere":
             of_ngsolve[name] = seconds / time_of_ngsolve(
                 magnet, points, exact, rms(found - exact))

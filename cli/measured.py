@@ -304,7 +304,6 @@ def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     has the instruments that were found.
     """
     from halbach_fe.inference.infer import observation_of
-    from halbach_fe.inference.storage import write_inference
     from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
     from halbach_fe.measurement.field_map import refuse_total_field
 
@@ -342,7 +341,6 @@ def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
         if arguments.samples:
             from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 
-            write_inference(result, arguments.output)  # to be kept even if the chains fail
             with common.workers(arguments) as pool:
                 sampled = sample_posterior(
                     result, session, arguments.samples, seed=arguments.seed or 1, say=common.say,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +102,7 @@ class DemagnetizationMap(ShownInNotebook):
     magnet : Magnet
         The magnet with its remanence at the reference temperature.
     material : Demagnetization
-        The study's demagnetization data of the material.
+        The study's demagnetization data, of the array's material.
     blocks : tuple of MagnetBlock
         Blocks with their remanence at the material's temperature.
     cells : Cells
@@ -111,6 +111,8 @@ class DemagnetizationMap(ShownInNotebook):
     places : Places
         H along the magnetization anywhere in the cells, of which shares and limits follow: the
         middles miss what is past the knee in parts of cells alone, as at faces and edges.
+    kinds : tuple of Demagnetization
+        Data of every material among the blocks.
     """
 
     magnet: Magnet
@@ -124,6 +126,23 @@ class DemagnetizationMap(ShownInNotebook):
     def study(self) -> Study:
         """The study of the magnet."""
         return self.magnet.study
+
+    @cached_property
+    def kinds(self) -> tuple[Demagnetization, ...]:
+        """Data of every material among the magnetized blocks."""
+        found = [self.magnet.demagnetizations[number] for number in np.unique(self.cells.block)]
+        return tuple(dict.fromkeys(found))
+
+    def _of(self, cells: Ints, law: Callable[[Demagnetization], Floats | float]) -> Floats:
+        """Return what a law says of the materials of cells (n,), (n,)."""
+        return np.array([float(law(kind)) for kind in self.kinds])[self._kind_of_cell[cells]]
+
+    @cached_property
+    def _kind_of_cell(self) -> Ints:
+        """Number (cells,) of each cell's material among `kinds`."""
+        numbers = {kind: number for number, kind in enumerate(self.kinds)}
+        return np.array([numbers.get(kind, -1) for kind in self.magnet.demagnetizations])[
+            self.cells.block]
 
     @property
     def share_error(self) -> float:
@@ -142,12 +161,12 @@ class DemagnetizationMap(ShownInNotebook):
     @property
     def past_the_knee(self) -> Bools:
         """Whether the places (n,) are past the knee at the temperature of the map."""
-        return np.asarray(self.places.along < -knee(self.material, self.material.temperature_C))
+        return np.asarray(self.places.along < -self._of(self.places.cell, knee_now))
 
     @property
     def margin(self) -> Floats:
         """Margin between H and the knee, (cells,) in A/m; negative past the knee."""
-        return self.along + knee(self.material, self.material.temperature_C)
+        return self.along + self._of(np.arange(len(self.along)), knee_now)
 
     @property
     def share_beyond_now(self) -> float:
@@ -158,18 +177,21 @@ class DemagnetizationMap(ShownInNotebook):
     def share_beyond(self, temperature_C: Floats) -> Floats:
         """Return the share of the volume past the knee, for temperatures (t,) in °C.
 
-        H is assumed to be proportional to the remanence when the temperature changes, but for that
-        of external sources. This is exact without iron, and for iron of constant permeability
-        unless these magnetize it.
+        H is assumed to be proportional to the block's own remanence when the temperature changes,
+        but for that of external sources. This is exact of one material without iron, and for iron
+        of constant permeability unless these magnetize it.
         """
         weight = self.places.volumes / self.places.volumes.sum()
-        grown = (remanence_factor(self.material, temperature_C)
-                 / remanence_factor(self.material, self.material.temperature_C))
-        limit = knee(self.material, temperature_C)
         outside = self.places.outside
         own = self.places.along - outside
-        return np.array([weight[own * g + outside < -h].sum()
-                         for g, h in zip(grown, limit, strict=True)])
+
+        def beyond(temperature_C: float) -> float:
+            grown = self._of(self.places.cell, lambda kind: remanence_factor(kind, temperature_C)
+                             / remanence_factor(kind, kind.temperature_C))
+            limit = self._of(self.places.cell, lambda kind: knee(kind, temperature_C))
+            return float(weight[own * grown + outside < -limit].sum())
+
+        return np.array([beyond(each) for each in temperature_C.tolist()])
 
     @property
     def worst_when_cold(self) -> bool:
@@ -183,23 +205,24 @@ class DemagnetizationMap(ShownInNotebook):
         every one above absolute zero. Where `worst_when_cold`, it is the lowest such temperature,
         and the signs of the infinities are the others.
         """
-        material, outside = self.material, self.places.outside
-        at_reference = (outside - self.places.along) / remanence_factor(
-            material, material.temperature_C)
+        cell, outside = self.places.cell, self.places.outside
+        at_reference = (outside - self.places.along) / self._of(
+            cell, lambda kind: remanence_factor(kind, kind.temperature_C))
         # solve -own (1 + alpha d) - outside = knee (1 + beta d) for the temperature difference d of
         # each place, where alpha and beta are the coefficients of remanence and coercivity
-        rate = (at_reference * material.remanence_coefficient_per_K
-                - knee(material, material.reference_temperature_C)
-                * material.coercivity_coefficient_per_K)
-        spare = knee(material, material.reference_temperature_C) - at_reference + outside
+        before = self._of(cell, lambda kind: knee(kind, kind.reference_temperature_C))
+        rate = (at_reference * self._of(cell, lambda kind: kind.remanence_coefficient_per_K)
+                - before * self._of(cell, lambda kind: kind.coercivity_coefficient_per_K))
+        spare = before - at_reference + outside
         sign = -1 if self.worst_when_cold else 1
         with np.errstate(divide="ignore", invalid="ignore"):
             limit = np.where(sign * rate > 0, spare / rate,
                              np.where(spare > 0, sign * np.inf, -sign * np.inf))
+        limit += self._of(cell, lambda kind: kind.reference_temperature_C)
         order = np.argsort(sign * limit)
         passed = np.cumsum(self.places.volumes[order]) / self.places.volumes.sum()
         first = int(np.searchsorted(passed, share + 1e-12))
-        found = float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
+        found = float(limit[order][min(first, len(limit) - 1)])
         return found if found > ABSOLUTE_ZERO_C else -np.inf
 
     @property
@@ -209,14 +232,16 @@ class DemagnetizationMap(ShownInNotebook):
         return None if LINEAR[0] <= factor <= LINEAR[1] else factor
 
     def coercivity_factor(self, temperature_C: float) -> float:
-        """Return the coercivity at a temperature by the linear law, over that of the reference."""
-        return float(knee(self.material, temperature_C)
-                     / knee(self.material, self.material.reference_temperature_C))
+        """Return the coercivity at a temperature by the linear law, over that of the reference, of
+        the material of which it changes most.
+        """
+        return max((float(knee(kind, temperature_C) / knee(kind, kind.reference_temperature_C))
+                    for kind in self.kinds), key=lambda factor: abs(np.log(max(factor, 1e-9))))
 
     def by_block(self) -> list[dict[str, Any]]:
         """Return a row per magnetized block: H, margins, and the coercivity that it would need."""
-        share_of_coercivity = float(knee(self.material, self.material.temperature_C)
-                                    / self.material.intrinsic_coercivity_A_per_m)
+        share_of_coercivity = self._of(np.arange(len(self.along)), lambda kind: knee_now(kind)
+                                       / kind.intrinsic_coercivity_A_per_m)
         rows: list[dict[str, Any]] = []
         past, block = self.past_the_knee, self.cells.block[self.places.cell]
         for number in np.unique(self.cells.block):
@@ -232,7 +257,8 @@ class DemagnetizationMap(ShownInNotebook):
                 "margin_A_per_m": float(self.margin[mine].min()),
                 "share_beyond_knee": float(
                     self.places.volumes[past & (block == number)].sum() / volume.sum()),
-                "needed_coercivity_A_per_m": max(0.0, -float(along[worst])) / share_of_coercivity,
+                "needed_coercivity_A_per_m": max(0.0, -float(along[worst]))
+                / float(share_of_coercivity[mine][worst]),
             })
         return rows
 
@@ -249,6 +275,11 @@ def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
         np.asarray(temperature_C) - material.reference_temperature_C)
     return np.asarray(material.squareness * material.intrinsic_coercivity_A_per_m
                       * np.maximum(0.0, factor))
+
+
+def knee_now(material: Demagnetization) -> float:
+    """Return |H| of the knee in A/m at the temperature that the study states."""
+    return float(knee(material, material.temperature_C))
 
 
 def demagnetization_map(
@@ -281,7 +312,11 @@ def demagnetization_map(
             "Add [demagnetization] with temperature_C"
             + (f", and {', '.join(keys)} from the data sheet." if keys else
                f": the rest is known of {magnet.array.material}.")))
-    warm = at_temperature(magnet, material)
+    if len({each.coercivity_coefficient_per_K > 0 for each in magnet.demagnetizations}) > 1:
+        raise StudyError(must_be(
+            "`material` of rings and blocks", f"study {magnet.name}", "all of ferrite or none",
+            "both", "Ferrite loses magnetization in the cold, and other magnets in the heat."))
+    warm = at_temperature(magnet)
     blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]
     cells = cut(blocks, magnetized, across)
@@ -347,11 +382,15 @@ def _reaction_by_moments(
     return np.vstack([np.mean(field, axis=0), reaction.field(points[len(every):])])
 
 
-def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
-    """Return the magnet whose blocks have the remanence of the material's temperature."""
-    factor = float(remanence_factor(material, material.temperature_C))
-    return magnet.with_(array__exceptions=(
-        *magnet.array.exceptions, BlockException(magnetization_factor=factor)))
+def at_temperature(magnet: Magnet) -> Magnet:
+    """Return the magnet whose blocks have the remanence of their materials' temperature."""
+    factors = {block.place: float(remanence_factor(material, material.temperature_C))
+               for block, material in zip(magnet.blocks, magnet.demagnetizations, strict=True)}
+    alike = len(set(factors.values())) == 1
+    return magnet.with_(array__exceptions=(*magnet.array.exceptions, *(
+        BlockException(magnetization_factor=factor, **({} if alike else {
+            "ring": ring, "slot": slot}))
+        for (ring, slot), factor in list(factors.items())[:1 if alike else None])))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:

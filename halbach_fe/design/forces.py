@@ -5,10 +5,10 @@ charge,
 
     ``F = 1/mu_0 int (J.n) B dS``,  ``T = 1/mu_0 int (J.n) (r - m) x B dS``,
 
-with n the outward normal and m the middle of the block (J. D. Jackson, Classical Electrodynamics,
-3rd ed., problem 5.20). B is the exact field of the others' surface charge, and the integrals are
-sums over Gauss points of the faces, of high order where the other block is near. The order grows
-until the forces of two successive orders differ by at most 1 %; that difference is the
+with n the outward normal and m the centre of mass of the block (J. D. Jackson, Classical
+Electrodynamics, 3rd ed., problem 5.20). B is the exact field of the others' surface charge, and the
+integrals are sums over Gauss points of the faces, of high order where the other block is near. The
+order grows until the forces of two successive orders differ by at most 1 %; that difference is the
 error bar.
 
 Blocks of another permeability than vacuum, or with irreversible losses, have the polarization that
@@ -82,7 +82,7 @@ class Loads:
 
     force_N: Floats
     torque_Nm: Floats
-    """Along x, y and z of the magnet; torques about the middles of the blocks.
+    """Along x, y and z of the magnet; torques about the centres of mass of the blocks.
     Shape (blocks, 3)."""
     error_N: Floats
     error_Nm: Floats
@@ -234,7 +234,7 @@ def _with_error_of_iron(loads: Loads, charges: Charges, blocks: Sequence[MagnetB
     """
     if iron.coarse is None:
         return loads
-    middles = np.array([block.mounted_middle for block in blocks])
+    middles = np.array([block.centre_of_mass for block in blocks])
     whole, coarse = (charges.loads(each.field(charges.points), middles, len(blocks))
                      for each in (iron, iron.coarse))
     bars = []
@@ -283,19 +283,10 @@ def _polarized(
 
 def _densities(magnet: Magnet, given: float | None) -> Floats:
     """Return the density of every block that is there, in kg/m^3."""
-    array, table = magnet.array, magnet.array.free_blocks
-    first = len(magnet.blocks) - (len(table) if table else 0)
-    of_ring = {ring: array.ring[ring - 1].material if array.ring else None
-               for ring in range(1, array.rings + 1)}
-    found = []
-    for number, block in enumerate(magnet.blocks):
-        if not present_blocks((block,)):
-            continue
-        name = (table.value("material", number - first) if table and number >= first
-                else of_ring[block.ring]) or array.material
-        found.append(given or (np.mean(grade(str(name)).density_kg_per_m3) if name
-                               else DENSITY_KG_PER_M3))
-    return np.array(found)
+    return np.array([
+        given or (np.mean(grade(name).density_kg_per_m3) if name else DENSITY_KG_PER_M3)
+        for block, name in zip(magnet.blocks, magnet.materials, strict=True)
+        if present_blocks((block,))])
 
 
 def _converged(
@@ -353,7 +344,7 @@ def _loads(
     """
     near, far = (Charges.of([blocks[number] for number in targets], order)
                  for order in (near_order, far_order))
-    middles = np.array([block.mounted_middle for block in blocks])
+    middles = np.array([block.centre_of_mass for block in blocks])
     reach = np.array([_reach(block) for block in blocks])
     tree = KDTree(middles[targets])
     near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
@@ -401,7 +392,7 @@ def _jump(block: MagnetBlock, points: Floats, normals: Floats) -> Floats:
 def _reach(block: MagnetBlock) -> float:
     """Return the radius in m of a sphere about the middle that contains the block."""
     points = block.from_frame(at_heights(along_edges(block.outline, 5), block.z_min, block.z_max))
-    return float(np.linalg.norm(points - block.mounted_middle, axis=1).max())
+    return float(np.linalg.norm(points - block.centre_of_mass, axis=1).max())
 
 
 @dataclass(frozen=True)

@@ -433,11 +433,9 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
     >>> columns["shape"][0], columns["name"][:2]
     ('sector', ['r01s01', 'r01s02'])
     """
-    table, array = magnet.array.free_blocks, magnet.array
+    table = magnet.array.free_blocks
     first = len(magnet.blocks) - (len(table) if table else 0)
     rows = []
-    materials = [array.of_ring(ring).material if array.ring else array.material
-                 for ring in range(1, array.rings + 1)]
     for number, block in enumerate(magnet.blocks):
         if not (block.remanence or block.is_permeable):
             continue  # a missing block has no effect on the field
@@ -445,7 +443,7 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
             row = _free_row(block, table, number - first)
         else:
             row = _ring_row(block)
-            row["material"] = materials[block.ring - 1]
+            row["material"] = magnet.materials[number]
         rows.append(row | _material(block))
     columns = {column: [row.get(column) for row in rows] for column in COLUMNS}
     return {column: values for column, values in columns.items()

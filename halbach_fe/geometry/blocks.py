@@ -22,6 +22,7 @@ from halbach_fe.geometry.outline import (
     at_heights,
     mean_corner,
     outline_area,
+    outline_centroid,
     outline_part,
     ring_radii,
 )
@@ -96,6 +97,12 @@ class MagnetBlock:
     def mounted_middle(self) -> Floats:
         """Middle of the block where it is mounted, (3,) in m."""
         return np.asarray(self.middle + self.displacement_m)
+
+    @cached_property
+    def centre_of_mass(self) -> Floats:
+        """Centre of mass of a block of finite length where it is mounted, (3,) in m."""
+        return self.from_frame(np.append(
+            outline_centroid(self.outline), (self.z_min + self.z_max) / 2))
 
     @cached_property
     def axes(self) -> Floats:

@@ -45,7 +45,7 @@ from halbach_fe.geometry.overlaps import (
 from halbach_fe.geometry.surface import Body, Surroundings, surroundings
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
-from halbach_fe.study.magnet import AnyCoil, External, Neighbour
+from halbach_fe.study.magnet import AnyCoil, Demagnetization, External, Neighbour
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS, look_like_mm
@@ -145,6 +145,25 @@ class Magnet(ShownInNotebook):
     def is_nonlinear(self) -> bool:
         """Whether the field is a non-linear function of the magnetizations (iron with a curve)."""
         return is_nonlinear(self.study)
+
+    @cached_property
+    def materials(self) -> tuple[str | None, ...]:
+        """Name of the grade of every block; None where the study names none."""
+        array, table = self.array, self.array.free_blocks
+        of_ring = {ring: one.material for ring, one in enumerate(array.ring, start=1)}
+        own = [of_ring.get(block.ring) for block in self.blocks]
+        if table is not None:
+            first = len(own) - len(table)
+            own[first:] = [table.material[number] if table.material else None
+                           for number in range(len(table))]
+        return tuple(each or array.material for each in own)
+
+    @cached_property
+    def demagnetizations(self) -> tuple[Demagnetization, ...]:
+        """What the material of every block withstands, see `Study.demagnetization_of`."""
+        known = {name: self.study.demagnetization_of(name) for name in dict.fromkeys(
+            self.materials)}
+        return tuple(known[name] for name in self.materials)
 
     @property
     def has_losses(self) -> bool:

@@ -135,6 +135,19 @@ def outline_area(outline: Outline) -> float:
     return total
 
 
+def outline_centroid(outline: Outline) -> Floats:
+    """Return the centroid (2,) in m of the area inside an outline, by Green's theorem.
+
+    The quadrature is exact on straight edges, and to rounding on arcs.
+    """
+    t, weight = np.polynomial.legendre.leggauss(16)
+    total = np.zeros(2)
+    for edge in outline:
+        points, normals = edge.at((t + 1) / 2)
+        total += np.sum(weight[:, None] / 4 * points**2 * normals, axis=0)
+    return total / outline_area(outline)
+
+
 @lru_cache(maxsize=4096)
 def ring_radii(outline: Outline) -> tuple[float, float] | None:
     """Return inner and outer radius in m of a sector of a whole turn, whose seam is no surface.

@@ -117,9 +117,9 @@ def no_symmetry(magnet: Magnet) -> Symmetry:
 def symmetry_of(magnet: Magnet) -> Symmetry:
     """Return the symmetry under rotations about z by whole blocks and reflection in z = 0.
 
-    The shapes and permeabilities of the blocks decide; their magnetizations may differ, because
-    fields are computed per unit of magnetization. Rings that differ, free blocks and poles of iron
-    have no symmetry here.
+    The shapes and permeabilities of the blocks decide, and whether coaxial iron is its own mirror
+    image; their magnetizations may differ, because fields are computed per unit of magnetization.
+    Rings that differ, free blocks and poles of iron have no symmetry here.
     """
     if not magnet.array.is_uniform or not magnet.iron_is_axisymmetric:
         return no_symmetry(magnet)
@@ -130,7 +130,10 @@ def symmetry_of(magnet: Magnet) -> Symmetry:
     pitch = 2 * np.pi / slots
     period = next(k for k in range(1, slots + 1) if slots % k == 0 and _is_periodic(
         outlines, tensors, k, pitch))
-    mirror = magnet.dimension == 3 and _equal(tensors, tensors[::-1])
+    ends = np.array([(body.inner_radius, body.outer_radius, body.z_min, body.z_max)
+                     for body in magnet.iron]).reshape(-1, 4)
+    mirror = magnet.dimension == 3 and _equal(tensors, tensors[::-1]) and (
+        not len(ends) or _coincide(ends, ends[:, [0, 1, 3, 2]] * [1, 1, -1, -1]))
     images = []
     for number in range(len(blocks)):
         ring, slot = divmod(number, slots)
@@ -149,7 +152,7 @@ def _is_periodic(outlines: list[Outline], tensors: Floats, step: int, pitch: flo
     if not _equal(np.roll(space @ tensors @ space.T, step, axis=1), tensors):
         return False
     turn = space[:2, :2]
-    return all(_apart(_ends(outline) @ turn.T, _ends(other)) < 1e-9
+    return all(_coincide(_ends(outline) @ turn.T, _ends(other))
                for outline, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
 
 
@@ -160,6 +163,11 @@ def _equal(tensors: Floats, others: Floats) -> bool:
 
 def _ends(outline: Outline) -> Floats:
     return np.array([edge.start for edge in outline])
+
+
+def _coincide(corners: Floats, others: Floats) -> bool:
+    """Tell whether two sets of points (n, d) in m are the same but for the rounding of turns."""
+    return _apart(corners, others) < 1e-9
 
 
 def _apart(corners: Floats, others: Floats) -> float:

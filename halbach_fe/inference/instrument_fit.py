@@ -48,6 +48,7 @@ from halbach_fe.measurement.instrument import (
     with_terms,
 )
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.block_variation import STEP
 from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import (
     CovarianceFactor,
@@ -58,6 +59,7 @@ from halbach_fe.stats.gaussian import (
 )
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.inference import shifted
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
@@ -220,43 +222,47 @@ def amplitude_columns(
     field : callable
         See `OpenTerms.columns`.
     """
-    # Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
-    # laws are linear to 1e-6 over it.
-    amplitude_step = 1e-3
     uncertain = [one for one in study.uncertain if one.is_of_instrument]
-    sides = [[shifted(study, one, sign * amplitude_step * one.sd) for sign in (1, -1)]
-             for one in uncertain]
+    sides = [[shifted(study, one, sign * STEP * one.sd) for sign in (1, -1)] for one in uncertain]
     found = []
     for number, one in enumerate(maps):
         data = in_si_and_magnet_axes(one.study.instrument, one.data)
-        points = points_of(data)
-        before = sensor_positions(one.study.instrument, points)
-        at_sensors, gradient = field_at_sensors(field, before)
+        before = sensor_positions(one.study.instrument, points_of(data))
+        at = (before, *field_at_sensors(field, before))
+        along = readings.directions.get(one.name) if is_total_field(data) else None
 
         def off(other: Study, number: int = number, data: xr.Dataset = data,
-                points: Floats = points, before: Floats = before,
-                at_sensors: Floats = at_sensors, gradient: Floats = gradient,
-                name: str = one.name, listed: bool = not one.is_validation) -> Floats:
-            """Return what the sensors show, less the values that are read."""
+                at: tuple[Floats, Floats, Floats] = at, along: Floats | None = along,
+                listed: bool = not one.is_validation) -> Floats:
             own = (other.of_map(number).instrument if other.maps and listed
                    else other.instrument)  # which a held-out map has
-            away = sensor_positions(own, points) - before
-            shown = seen(sensor_matrix(own), at_sensors + np.einsum(
-                "nscj,nsj->nsc", gradient, away))
             try:
-                if not is_total_field(data):
-                    return shown - np.nan_to_num(remove_nonlinear_part(own, data))
-                along = readings.directions[name]
-                return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
-                    total_without_nonlinear_part(own, data)))[:, None]
+                return shown_less_read(own, data, at, along)
             except MeasurementError:
                 if listed:
                     raise
-                return 0 * shown  # what a probe of such a held-out map cannot have
+                return 0 * at[0][:, 0]  # what a probe of such a held-out map cannot have
 
-        found.append(np.array([(off(more) - off(less)) / (2 * amplitude_step)
-                               for more, less in sides]).reshape(-1, len(points), 3))
+        found.append(np.array([(off(more) - off(less)) / (2 * STEP)
+                               for more, less in sides]).reshape(-1, len(before), 3))
     return readings.observation.read(np.concatenate(found, axis=1)).T
+
+
+def shown_less_read(
+    own: Instrument, data: xr.Dataset, at: tuple[Floats, Floats, Floats], along: Floats | None
+) -> Floats:
+    """Return what sensors show by an instrument, less the values (n, 3) in T that are read by it.
+
+    ``at`` are places of sensors, near which they are, with field and gradient there, see
+    `field_at_sensors`. What a map of |B| reads is along directions ``along`` (n, 3).
+    """
+    before, at_sensors, gradient = at
+    away = sensor_positions(own, points_of(data)) - before
+    shown = seen(sensor_matrix(own), at_sensors + np.einsum("nscj,nsj->nsc", gradient, away))
+    if along is None:
+        return shown - np.nan_to_num(remove_nonlinear_part(own, data))
+    return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
+        total_without_nonlinear_part(own, data)))[:, None]
 
 
 def readings_of_field(

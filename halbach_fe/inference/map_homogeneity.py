@@ -1,6 +1,6 @@
 """Homogeneity of a measured map itself: a harmonic fit of its readings, without any magnet.
 
-In the sphere about the region's centre that blocks and iron leave free, the field is a sum of
+In the sphere about the region's centre that sources leave free, the field is a sum of
 gradients of solid harmonics. Their amplitudes have a normal prior, of the same width on that sphere
 for all, which the evidence of the readings chooses; the uniform field is as good as free. With the
 covariance that the noise of the readings leaves they give the field in a region within the map.
@@ -31,7 +31,10 @@ from scipy.linalg import block_diag, solve_triangular
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.blocks import present_blocks
+from halbach_fe.geometry.cells import distance_from_blocks
+from halbach_fe.geometry.coils import distance_in_magnet
+from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns
 from halbach_fe.inference.readings import (
     Readings,
@@ -56,7 +59,7 @@ WITHIN = 0.75
 series has no end."""
 
 DIRECTIONS = 60
-"""Degree of the directions in which the free sphere is looked for (6° apart)."""
+"""Degree of the directions in which iron is looked for about a region's centre (6° apart)."""
 
 POOR = 1.15
 """Noise that a fit finds, relative to the stated one, above which it is not to be relied on: the
@@ -347,15 +350,20 @@ def _fields(points: Floats) -> Floats:
 
 
 def _free_radius(magnet: Magnet, centre: Floats) -> float:
-    """Return the radius in m of the sphere about a point that blocks and iron leave free."""
+    """Return the radius in m of the sphere about a point that blocks, iron, coils and dipoles leave
+    free.
+    """
+    shells = 100  # so many are asked for iron: its bodies have no distance from a point
+    external, here = magnet.external, centre[None]
+    blocks = (*present_blocks(magnet.blocks),
+              *neighbour_blocks(magnet.blocks, external.neighbours))
+    free = float(min([
+        *distance_from_blocks(blocks, here, magnet.field_reach),
+        *(distance_in_magnet(coil, here)[0] for coil in external.coils),
+        *(np.linalg.norm(centre - one.position_m) for one in external.dipoles)]))
     directions, _ = sphere_points(DIRECTIONS)
-    low, high = 0.0, magnet.field_reach
-    tried = 8  # number of radii at once
-    while high - low > 1e-3 * high:
-        middle = (low + high) / 2
-        shells = np.linspace(low, middle, tried)[1:, None, None] * directions
-        if magnet.contains(centre + shells.reshape(-1, 3)).any():
-            high = middle
-        else:
-            low = middle
-    return low
+    for number in range(1, shells + 1 if magnet.iron else 1):
+        points = centre + number / shells * free * directions
+        if any(body.contains(points).any() for body in magnet.iron):
+            return (number - 1) / shells * free
+    return free

@@ -1,9 +1,10 @@
 """Least squares of a map's pose, its probe and open numbers, together with the blocks.
 
 The magnetizations of the blocks have the study's prior and are eliminated from the normal
-equations; derivatives by the pose are those in the field of the blocks that explain the readings
-best. On a line, where a wrong start is bent into shape by blocks, noise is added at first and
-taken away in steps.
+equations, with what the study leaves open beside them: uncertain amplitudes of the instrument, and
+the blocks of neighbours. Derivatives by the pose are those in the field of the blocks that explain
+the readings best. On a line, where a wrong start is bent into shape by blocks, noise is added at
+first and taken away in steps.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, m
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.instrument_fit import shown_less_read
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
 from halbach_fe.inference.pose_search import (
     LONGEST_M,
@@ -72,10 +74,11 @@ from halbach_fe.measurement.observation import (
     observe_total,
 )
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.response.block_variation import Deviations, study_prior
+from halbach_fe.response.block_variation import STEP, Deviations, neighbour_deviations, study_prior
 from halbach_fe.solver.routes import field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, largest_directions, root_matrix
+from halbach_fe.study.inference import shifted
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
@@ -138,6 +141,8 @@ class PoseFit:
     points: Floats
     readings: Floats
     """The map in m and T, by the study's units and axes. Shape (n, 3)."""
+    data: xr.Dataset
+    """The map as it was read, in these units and axes."""
     training: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
     """Shape (n, 3)."""
@@ -214,7 +219,7 @@ class PoseFit:
         deviations = Deviations.of(magnet)
         if blocks is None:
             blocks = study_prior(magnet, deviations.count - len(magnet.parameter_names))
-        return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
+        return cls(magnet, points, np.nan_to_num(readings), data, training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
                    session, probe, base, open_keys, pose.sd(magnet), pose.stage is not None,
                    deviations, blocks, total)
@@ -236,9 +241,14 @@ class PoseFit:
                                np.full(3, probe.offset_T), np.full(9, probe.sensor_m),
                                np.array([each.sd for each in self.open])])
 
-    def instrument(self, pose: Floats, values: Floats) -> Instrument:
-        """Return the instrument of a pose (6,) and of the other parameters."""
-        base = self._base(values)
+    def instrument(
+        self, pose: Floats, values: Floats, study: Study | None = None
+    ) -> Instrument:
+        """Return the instrument of a pose (6,) and of the other parameters.
+
+        ``study`` is one of another instrument than this one.
+        """
+        base = self._base(values, study)
         middle = self._origin(base)
         return with_terms(base, middle, np.concatenate([
             pose[:3] - middle, pose[3:], self._of_probe(values[:PROBE]), np.zeros(3)]))
@@ -267,9 +277,11 @@ class PoseFit:
         return box_middle(sensor_positions(base.with_(
             sensor_position_m=((0.0, 0.0, 0.0),) * 3), self.points)[:, 0])
 
-    def _base(self, values: Floats) -> Instrument:
+    def _base(self, values: Floats, study: Study | None = None) -> Instrument:
         """Return the instrument without its pose, with the values of the open keys."""
-        study = self.magnet.study.with_(instrument=self.base)
+        own = self.base if study is None else study.instrument.with_(
+            translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
+        study = self.magnet.study.with_(instrument=own)
         for each, value in zip(self.open, each_value(self, values), strict=True):
             if each.of_instrument:
                 study = each.apply(study, value)
@@ -314,10 +326,11 @@ class PoseFit:
         (pose, values, state, columns), at_rest = self._come_to_rest(start, pose, values, pace)
         scaled = self.scaled(pose, values, start)
         updated, log_evidence, mean, covariance = state.updated(rows, scaled)
-        count = len(mean)
-        blocks = self._blocks(columns.directions, mean, covariance[:count, :count])
+        count, own = len(mean), columns.directions.shape[1]
+        blocks = self._blocks(columns.directions, mean[:own], covariance[:own, :own])
         of_terms = covariance[count:, count:] * np.outer(state.prior_sd, state.prior_sd)
         sd = np.sqrt(np.diag(of_terms))
+        sd[:3] = np.hypot(sd[:3], self._apart(pose, values))
         return Registration(
             self._study_to_update(pose, values, sd[:6]), self.instrument(pose, values),
             pose[:3], sd[:3], sd[3:6], self.pose_sd,
@@ -533,8 +546,13 @@ class PoseFit:
         shift = (flat @ (self.prior.mean - self._nominal)).reshape(-1, 3)
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
-        directions = largest_directions(flat, SEEN * self.smallest_sigma)
-        return _BlockColumns(middle, columns @ directions, shift, directions)
+        smallest = SEEN * self.smallest_sigma
+        directions = largest_directions(flat, smallest)
+        others = neighbour_deviations(self.magnet, middle)
+        others = np.moveaxis(others, 0, -1) @ largest_directions(
+            others.reshape(len(others), len(flat)).T, smallest)
+        return _BlockColumns(
+            middle, np.concatenate([columns @ directions, others], axis=2), shift, directions)
 
     @property
     def _nominal(self) -> Floats:
@@ -598,7 +616,8 @@ class PoseFit:
         amounts = cho_solve(cho_factor(inner, lower=True),
                             rows.T @ (residual[chosen] / sigma[chosen]))
         return np.asarray(self.prior.mean - self._nominal
-                          + root_matrix(self.prior.root) @ (near.directions @ amounts))
+                          + root_matrix(self.prior.root) @ (
+                              near.directions @ amounts[:near.directions.shape[1]]))
 
     def _state(self, pose: Floats, values: Floats, near: _BlockColumns) -> _State:
         """Return residual and derivatives of all readings at a pose and instrument."""
@@ -646,10 +665,51 @@ class PoseFit:
             there = here + np.einsum("nsck,nsk->nsc", gradient, moved)
             columns.append(self._shown(
                 (seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL, along))
-        return _State(residual, np.stack(columns, axis=-1), by_block, sigma,
+        beside = self._by_uncertain(pose, values, (sensors, here, gradient), along)
+        return _State(residual, np.stack(columns, axis=-1),
+                      np.concatenate([by_block, beside], axis=2), sigma,
                       np.concatenate([self.pose_sd, self.prior_sd()]),
                       self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
                           at_mean**2, axis=(1, 2)))))))
+
+    @cached_property
+    def _sides(self) -> list[tuple[Study, Study]]:
+        """The study with more and with less of every uncertain amplitude of its instrument."""
+        study = self.magnet.study
+        return [(shifted(study, one, STEP * one.sd), shifted(study, one, -STEP * one.sd))
+                for one in study.uncertain if one.is_of_instrument]
+
+    def _either(self, number: int, pose: Floats, values: Floats) -> tuple[Instrument, Instrument]:
+        """Return the instruments of both `_sides`, with the middle of the map in one place."""
+        more, less = self._sides[number]
+        return self.instrument(pose, values, more), self.instrument(pose, values, less)
+
+    def _by_uncertain(
+        self, pose: Floats, values: Floats, at: tuple[Floats, Floats, Floats], along: Floats
+    ) -> Floats:
+        """Return readings (n, 3, amplitudes) in T per standard deviation of what is uncertain of
+        the instrument.
+
+        ``at`` are sensors with their field, see `shown_less_read`. A few of the rows, which lead
+        near the end only, are not in the order of the scan.
+        """
+        found = np.zeros((0 if self.is_part else len(self._sides), *self.points.shape))
+        for number in range(len(found)):
+            more, less = (self._shown(shown_less_read(
+                one, self.data, at, along if self.total else None), along)
+                for one in self._either(number, pose, values))
+            found[number] = (more - less) / (2 * STEP)
+        return np.moveaxis(found, 0, -1)
+
+    def _apart(self, pose: Floats, values: Floats) -> Floats:
+        """Return the standard deviations (3,) in m by which uncertain amplitudes of the instrument
+        move the middle of the map against where the study's values have it, as a scale does that
+        is of a far origin.
+        """
+        found = [np.subtract(more.translation_m, less.translation_m) / (2 * STEP)
+                 for more, less in (self._either(number, pose, values)
+                                    for number in range(len(self._sides)))]
+        return np.sqrt(np.sum(np.square([np.zeros(3), *found]), axis=0))
 
 
 @dataclass(frozen=True)
@@ -659,8 +719,8 @@ class _BlockColumns:
     places: Floats
     """Shape (n, 3), in m."""
     fields: Floats
-    """B per prior standard deviation of k combinations of the magnetizations.
-    Shape (n, 3, k), in T."""
+    """B per prior standard deviation of k combinations of the magnetizations, followed by those of
+    neighbours' blocks. Shape (n, 3, k + neighbours), in T."""
     shift: Floats
     """B of the prior's mean less that of the nominal magnet. Shape (n, 3), in T."""
     directions: Floats
@@ -685,7 +745,8 @@ class _State:
     by_parameter: Floats
     """Derivatives by shifts, turns, and the other parameters. Shape (n, 3, p)."""
     by_block: Floats
-    """Readings per prior standard deviation of the magnetizations. Shape (n, 3, k), in T."""
+    """Readings per prior standard deviation of the magnetizations, and of what is eliminated with
+    them. Shape (n, 3, k + others), in T."""
     sigma: Floats
     """Shape (n, 3), in T."""
     prior_sd: Floats
@@ -737,8 +798,8 @@ class _State:
     def updated(
         self, rows: NDArray[np.bool_], scaled: Floats
     ) -> tuple[Floats, float, Floats, Floats]:
-        """Return residual (n, 3) in T, log evidence, mean (k,) of the blocks, and the covariance
-        (k + p, k + p) of blocks and parameters, in prior standard deviations.
+        """Return residual (n, 3) in T, log evidence, mean (k,) of ``by_block``, and the covariance
+        (k + p, k + p) of these and the parameters, in prior standard deviations.
         """
         residual, derivative, blocks = self._whitened(rows)
         design = np.hstack([blocks, derivative * self.prior_sd])

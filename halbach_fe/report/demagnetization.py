@@ -14,7 +14,13 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.design.demagnetization import LINEAR, SHARES, DemagnetizationMap, knee, write_vtu
+from halbach_fe.design.demagnetization import (
+    LINEAR,
+    SHARES,
+    DemagnetizationMap,
+    knee_now,
+    write_vtu,
+)
 from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
@@ -62,7 +68,7 @@ def demagnetization_summary(found: DemagnetizationMap) -> Plain:
     limits = {str(share): found.limit_temperature(share) for share in SHARES}
     return {
         "study": found.study.name, "temperature_C": temperature,
-        "knee_A_per_m": float(knee(material, temperature)),
+        "knee_A_per_m": float(found.margin[worst] - found.along[worst]),
         "least_H_A_per_m": float(found.along[worst]),
         "least_margin_A_per_m": float(found.margin[worst]),
         "at_m": found.cells.middles[worst].tolist(), "block": block.name, "ring": block.ring,
@@ -219,17 +225,19 @@ def page(found: DemagnetizationMap) -> Page:
     summary, blocks, material = demagnetization_summary(found), found.by_block(), found.material
     rows = _worst_block_table(blocks)
     reference_C = f"{material.reference_temperature_C:g} °C"
+    knees = "; of other blocks at ".join(
+        f"|H| = {1e-3 * knee_now(kind):.0f} kA/m: {kind.squareness:g} times the intrinsic "
+        f"coercivity, which is {1e-3 * kind.intrinsic_coercivity_A_per_m:.0f} kA/m at "
+        f"{kind.reference_temperature_C:g} °C and changes by "
+        f"{100 * kind.coercivity_coefficient_per_K:g} % per kelvin (the remanence by "
+        f"{100 * kind.remanence_coefficient_per_K:g} %)" for kind in found.kinds)
     of_all = f"{len(rows)} of {len(blocks)} blocks; all are in demagnetization.csv. "
     return Page("demagnetization", "demagnetization margin", found.study, answer(found), summary, [
         Section([
             "H is the field strength in the nominal magnet along each block's magnetization, in "
             f"{len(found.along)} cells. It is the exact field of the blocks in vacuum plus the "
             "finite-element field that the permeability of the blocks and the iron add. At this "
-            f"temperature the knee is at |H| = {1e-3 * knee(material, material.temperature_C):.0f} "
-            f"kA/m: {material.squareness:g} times the intrinsic coercivity, which is "
-            f"{1e-3 * material.intrinsic_coercivity_A_per_m:.0f} kA/m at {reference_C} and changes "
-            f"by {100 * material.coercivity_coefficient_per_K:g} % per kelvin (the remanence by "
-            f"{100 * material.remanence_coefficient_per_K:g} %).",
+            f"temperature the knee is at {knees}.",
             Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
                  "falls slightly with smaller cells (--across); shares of the volume converge. Not "
                  "modelled: fields across the easy axis, which demagnetize less, and the field "
@@ -291,7 +299,7 @@ def _map_figure(found: DemagnetizationMap) -> Figure:
     layers = _layers(found)
     figure = figure_of(5, 6.2) if len(layers) == 1 else figure_of(3.6)
     limits = 1e-3 * float(found.along.min()), 1e-3 * float(found.along.max())
-    threshold = -1e-3 * float(knee(found.material, found.material.temperature_C))
+    thresholds = [-1e-3 * knee_now(kind) for kind in found.kinds]
     axes: list[Axes] = list(figure.subplots(1, len(layers), squeeze=False)[0])
     for axis, (title, cells) in zip(axes, layers.items(), strict=True):
         faces = 1e3 * found.cells.vertices[found.cells.corners[cells, :4]][..., :2]
@@ -299,13 +307,14 @@ def _map_figure(found: DemagnetizationMap) -> Figure:
         drawn = PolyCollection(list(faces), array=values, cmap="cividis", edgecolors="face", lw=0.2)
         drawn.set_clim(*limits)
         axis.add_collection(drawn)
-        axis.add_collection(PolyCollection(list(faces[values < threshold]), facecolors="none",
+        axis.add_collection(PolyCollection(list(faces[found.margin[cells] < 0]), facecolors="none",
                                            edgecolors=PAST, lw=0.8))
         axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", title=title)
         axis.autoscale_view()
     bar = figure.colorbar(drawn, ax=axes, label="H along the magnetization in kA/m")
-    if limits[0] < threshold < limits[1]:
-        bar.ax.axhline(threshold, color=PAST, lw=2)
+    for threshold in thresholds:
+        if limits[0] < threshold < limits[1]:
+            bar.ax.axhline(threshold, color=PAST, lw=2)
     return figure
 
 
@@ -339,8 +348,8 @@ def _slots_figure(found: DemagnetizationMap) -> Figure:
                                       ("least_H_A_per_m", "smallest", MEASURED, 0.15)):
         values = 1e-3 * np.array([row[key] for row in rows])
         axis.plot(slots + shift, values, "o", ms=4, color=colour, label=words, alpha=0.7)
-    axis.axhline(-1e-3 * float(knee(found.material, found.material.temperature_C)), color=PAST,
-                 label="knee")
+    for number, kind in enumerate(found.kinds):
+        axis.axhline(-1e-3 * knee_now(kind), color=PAST, label="" if number else "knee")
     axis.axhline(0, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="slot", ylabel="H along the\nmagnetization in kA/m")
     legend_above(figure, axis, columns=3)

@@ -330,9 +330,10 @@ def page(found: Forces) -> Page:
             Section([
                 Table(rows),
                 f"Forces are those of the field of all other blocks{', of the iron' * iron} and of "
-                "external sources on a block; torques are about its middle. ± is the error of the "
-                f"quadrature{' and the change from a coarser mesh of the iron' * iron}. The last "
-                "two columns are the force on the block when it is inserted, with only the blocks "
+                "external sources on a block; torques are about its centre of mass. ± is the error "
+                "of the quadrature"
+                f"{' and the change from a coarser mesh of the iron' * iron}. The last two columns "
+                "are the force on the block when it is inserted, with only the blocks "
                 "before it in place, and its place in that order"
                 f"{'; the iron is not there yet' * iron}. The forces of all blocks on each other "
                 f"add up to {_newton(found.imbalance_N)}; Newton's third law makes it zero.",

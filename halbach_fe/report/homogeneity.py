@@ -130,7 +130,7 @@ def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:
 
 def _of_map(found: HomogeneityResult) -> str:
     """Say what the map itself has, of readings that did not update the magnet if there are some."""
-    remarks = "".join(f". {remark.rstrip('.')}" for remark in found.map_remarks)
+    remarks = "".join(f". {remark.rstrip('.')}" for remark in _map_remarks(found))
     if not found.of_map or found.map_misfit > POOR:
         return remarks
     name, known = best_known(found.of_map)
@@ -139,15 +139,13 @@ def _of_map(found: HomogeneityResult) -> str:
             f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high}){remarks}")
 
 
-def _misfit(found: HomogeneityResult) -> str:
-    """Say what the map does not tell, and that its fit cannot be relied on; nothing if it can."""
-    remarks = list(found.map_remarks)
-    if found.of_map and found.map_misfit > POOR:
-        remarks.append(
-            f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings "
-            "are too far apart for the field between them, or noisier than stated. What the map "
-            "itself has is uncertain beyond its error bars.")
-    return " ".join(remarks)
+def _map_remarks(found: HomogeneityResult) -> list[str]:
+    """Return sentences: what the map does not tell, and that its fit cannot be relied on."""
+    return [*found.map_remarks, *[
+        f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings "
+        "are too far apart for the field between them, or noisier than stated. What the map "
+        "itself has is uncertain beyond its error bars."
+    ] * bool(found.of_map and found.map_misfit > POOR)]
 
 
 def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, bool]:
@@ -253,7 +251,7 @@ def homogeneity_summary(found: HomogeneityResult) -> Plain:
         "stray_field": None if found.stray_field is None else found.stray_field.summary(),
         **{name: plain_homogeneity(known) for name, known in found.by_name.items()},
         "map_misfit": found.map_misfit if found.of_map else None,
-        "map_remarks": list(found.map_remarks),
+        "map_remarks": _map_remarks(found),
         "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 
@@ -350,7 +348,7 @@ def page(found: HomogeneityResult) -> Page:
             {"study": found.magnet.name, "convention": CONVENTION})
     remarks = " ".join(filter(None, (
         SIZES, "Ranges hold 95 % of the magnets drawn from the prior or posterior.",
-        MAP_ROWS if found.of_map else "", _misfit(found),
+        MAP_ROWS if found.of_map else "", *_map_remarks(found),
         "" if (own := f"{found.model.solver_error_ppm:.2g}") == "0" else
         f"The solver's own error is {own} ppm rms for a component.")))
     return Page(

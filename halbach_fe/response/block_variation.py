@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
-from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet, neighbour_blocks
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of
@@ -197,29 +197,33 @@ def study_prior(magnet: Magnet, count: int) -> Gaussian:
         settings.direction_sd_deg, settings.common_mode_sd), magnet, count)
 
 
-def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
-    """Return what neighbours' blocks deviate, as fields (k, n, 3) in T of independent modes.
+def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
+    """Return the blocks of each neighbour, and what they deviate (blocks, 3, k) in T of remanence
+    by independent modes.
 
-    Each is that of one standard deviation of the study's prior of magnetizations, at points (n, 3)
-    in m. The blocks of a neighbour are others than this magnet's, and were not measured.
+    Each is that of one standard deviation of the study's prior of magnetizations. The blocks of a
+    neighbour are others than this magnet's, and were not measured.
     """
     settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
     if not neighbours:
-        return np.zeros((0, *points.shape))
+        return []
     root = sparse.csr_array(root_matrix(nominal_prior(
         magnet.nominal_magnetization, 3, settings.magnitude_sd, settings.direction_sd_deg,
-        settings.common_mode_sd).root)).toarray()
-    found = []
-    for one in neighbours:
-        turn = rotation_about_z(np.radians(one.turn_deg))
-        local = (points - [0.0, 0.0, one.z_m]) @ turn
-        own = np.zeros((root.shape[1], *points.shape))
-        for number, (block, unit) in enumerate(zip(
-                magnet.blocks, unit_fields(magnet.blocks, local), strict=True)):
-            remanence = MU_0 * block.recoil_tensor @ root[3 * number:3 * number + 3]
-            own += np.moveaxis(unit @ remanence, -1, 0)
-        found.append(one.factor * own @ turn.T)
-    return np.concatenate(found)
+        settings.common_mode_sd).root)).toarray().reshape(len(magnet.blocks), 3, -1)
+    own = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks]) @ root
+    return [(neighbour_blocks(magnet.blocks, (one,)),
+             one.factor * rotation_about_z(np.radians(one.turn_deg)) @ own) for one in neighbours]
+
+
+def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
+    """Return the fields (k, n, 3) in T of all `neighbour_modes` at points (n, 3) in m."""
+    found = [np.zeros((*points.shape, 0))]
+    for blocks, modes in neighbour_modes(magnet):
+        own = np.zeros((*points.shape, modes.shape[2]))
+        for unit, mode in zip(unit_fields(blocks, points), modes, strict=True):
+            own += unit @ mode
+        found.append(own)
+    return np.moveaxis(np.concatenate(found, axis=2), -1, 0)
 
 
 def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
@@ -238,8 +242,8 @@ def with_variations(prior: Gaussian, count: int) -> Gaussian:
 
 
 STEP = 1e-3
-"""Step of the differences of exact fields and magnetizations, in standard deviations: geometry and
-materials are linear to 1e-6 over it, and rounding is 1e-12 of the field."""
+"""Step of the differences of exact fields, magnetizations and readings, in standard deviations:
+geometry, materials and laws of instruments are linear to 1e-6 over it, and rounding is 1e-12."""
 
 
 def amplitude_names(magnet: Magnet) -> tuple[str, ...]:

@@ -195,8 +195,19 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
                                  f"one of shape {points.shape}"))
     session = NOT_KEPT if magnet.is_vacuum else Session.temporary()  # closed forms write no file
     # as `halbach_fe.solve` has it, which extrapolates iron of any shape
-    field = field_function(magnet, session, estimate=not magnet.iron_is_axisymmetric)
-    return field(points.reshape(-1, 3)).reshape(points.shape)
+    estimate, flat = not magnet.iron_is_axisymmetric, points.reshape(-1, 3)
+    return _field_of_nominal(magnet, flat, session, estimate).reshape(points.shape)
+
+
+def _field_of_nominal(
+    magnet: Magnet, points: Floats, session: Session, estimate: bool
+) -> Floats:
+    """Return `solve_nominal`, of a cross-section at points (n, 3) in m of any z."""
+    if magnet.dimension == 3:
+        return solve_nominal(magnet, points, session, estimate)
+    plane = points * [1.0, 1.0, 0.0]
+    found = solve_nominal(magnet, plane, session)
+    return found + external_field(magnet, points) - external_field(magnet, plane)
 
 
 def field_function(
@@ -205,21 +216,14 @@ def field_function(
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
     It serves points that move little by little. The blocks are solved for once where that does not
-    depend on the points, and the field of many blocks is summed by expansions. That of a
-    cross-section does not depend on z, but for that of external sources. ``estimate`` is that of
-    `solve_nominal`.
+    depend on the points, and the field of many blocks is summed by expansions: 24 x 12 permeable
+    cubes were up to 8e-5 of their field off in the bore, 1.5e-5 rms. That of a cross-section does
+    not depend on z, but for that of external sources. ``estimate`` is that of `solve_nominal`.
     """
-    def solved(points: Floats) -> Floats:
-        if magnet.dimension == 3:
-            return solve_nominal(magnet, points, session, estimate)
-        plane = points * [1.0, 1.0, 0.0]
-        found = solve_nominal(magnet, plane, session)
-        return found + external_field(magnet, points) - external_field(magnet, plane)
-
     auto = magnet.study.solver.route == "auto" and not magnet.has_losses
     if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) is not Route.MOMENTS or (
             auto and is_axisymmetric(magnet)):
-        return solved
+        return lambda points: _field_of_nominal(magnet, points, session, estimate)
     reaction = solve_separate(magnet, session, estimate)
     vacuum = field_in_vacuum(magnet.blocks)
 

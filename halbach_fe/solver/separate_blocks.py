@@ -337,8 +337,8 @@ class _Blocks:
 
     blocks: tuple[MagnetBlock, ...]
     """Those that are there."""
-    law: KneeLaw | None
-    """Of irreversible losses, if there are any."""
+    laws: tuple[KneeLaw, ...] | None
+    """Of irreversible losses of each, if there are any."""
     varies: bool
     """Whether the study infers variations inside the blocks."""
     cells_per_side: int | None
@@ -349,15 +349,16 @@ class _Blocks:
     @classmethod
     def of(cls, magnet: Magnet, sizes: int) -> _Blocks:
         """Return those of a magnet."""
-        law, material = None, magnet.study.demagnetization
-        if magnet.has_losses and material is not None:
-            law = KneeLaw.of(material)
-        return cls(present_blocks(magnet.blocks), law, magnet.study.prior.variation_sd > 0,
+        laws = None
+        if magnet.has_losses:
+            laws = tuple(KneeLaw.of(material) for block, material in zip(
+                magnet.blocks, magnet.demagnetizations, strict=True) if present_blocks((block,)))
+        return cls(present_blocks(magnet.blocks), laws, magnet.study.prior.variation_sd > 0,
                    magnet.study.mesh.cells_per_side, sizes)
 
     def systems(self) -> tuple[System, ...]:
         """Return the blocks in cells, see `refinement`; none where nothing reacts."""
-        if not _permeable(self.blocks) and self.law is None:
+        if not _permeable(self.blocks) and self.laws is None:
             return ()
         return refinement(self.blocks, self.cells_per_side)[:self.sizes]
 
@@ -373,7 +374,7 @@ class _Blocks:
         """
         applied = None if iron is None else _sum_of_fields(iron.field, others)
         first = known or [self.polarized(system, applied) for system in systems[:1]]
-        if self.law is None or len(systems) < 2:
+        if self.laws is None or len(systems) < 2:
             return SeparateReaction(
                 (*first, *(self.polarized(system, applied) for system in systems[1:])), iron)
         by_mean = () if self.varies else (self.polarized(systems[0], applied, by_mean=True),)
@@ -386,9 +387,11 @@ class _Blocks:
 
         ``by_mean`` tells whether to use the mean field of the cells, see `solve_irreversible`.
         """
-        if self.law is None:
+        if self.laws is None:
             return system.solve(applied)
-        return solve_irreversible(system, self.law, applied, by_mean=by_mean)[0]
+        coercivity = np.array([law.coercivity_T for law in self.laws])
+        law = replace(self.laws[0], coercivity_T=coercivity[system.interaction.cells.block])
+        return solve_irreversible(system, law, applied, by_mean=by_mean)[0]
 
 
 @lru_cache(maxsize=2)  # every map of a campaign, and every round of an update, asks for the same

@@ -21,7 +21,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
-from halbach_fe.study.grades import STRENGTHS, grade_of
+from halbach_fe.study.grades import STRENGTHS, grade, grade_of
 from halbach_fe.study.inference import (
     POSE_KEYS,
     PROBE_KEYS,
@@ -215,8 +215,8 @@ class Study(StudyModel, metaclass=_OfKeys):
                              "the field could be homogeneous")
         if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
             raise ValueError("prior.variation_sd needs a 3D study without iron")
-        self._check_maps()
         check_uncertain(self)
+        self._check_maps()
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
             "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),
@@ -275,13 +275,51 @@ class Study(StudyModel, metaclass=_OfKeys):
         return f"Study({self.name})"
 
     def of_map(self, number: int) -> Study:
-        """Return the study of one of the maps alone, with the map's own tables."""
+        """Return the study of one of the maps alone, with the map's own tables.
+
+        Of amplitudes that change several instruments it has what they change of its own.
+        """
         one = self.maps[number]
         own = {key: getattr(one, key) for key in (
             "instrument", "instrument_sd", "noise", "inference") if getattr(one, key) is not None}
         values = {name: getattr(self, name) for name in type(self).model_fields}
-        of_magnet = tuple(each for each in self.uncertain if not each.is_of_instrument)
-        return type(self).model_validate(values | own | {"maps": (), "uncertain": of_magnet})
+        mine = f"maps[{number + 1}]."
+
+        def own_name(name: str) -> str:
+            if name.startswith("maps["):
+                return name.removeprefix(mine) if name.startswith(f"{mine}instrument.") else ""
+            return "" if one.instrument and name.startswith("instrument.") else name
+
+        uncertain = [each.with_(change=change) for each in self.uncertain if (change := {
+            own_name(name): value for name, value in each.change.items()
+            if value and own_name(name)})]
+        return type(self).model_validate(values | own | {"maps": (), "uncertain": uncertain})
+
+    def demagnetization_of(self, material: str | None) -> Demagnetization:
+        """Return what blocks of a grade withstand, by the name of the grade.
+
+        Numbers that the table states otherwise than the grade of the array hold for all blocks.
+
+        Raises
+        ------
+        StudyError
+            If there is no table, or the grade lacks a number, or differs in what no table can hold.
+        """
+        table, of_array = self.demagnetization, grade_of(self.array)
+        if table is None:
+            raise StudyError(must_be("`demagnetization`", f"study {self.name}",
+                                     "what the material withstands", "nothing"))
+        if of_array is None or material in (None, of_array.name):
+            return table
+        own = grade(str(material)).demagnetization_defaults
+        of_grade = [key for key, value in of_array.demagnetization_defaults.items()
+                    if getattr(table, key) == value]
+        if missing := [key for key in of_grade if key not in own]:
+            raise StudyError(must_be(
+                f"`demagnetization.{missing[0]}`", f"study {self.name}", "given otherwise than "
+                f"that of {of_array.name}, to hold for all blocks", "that of this grade alone, "
+                f"while others are of {material}, of which it is not known"))
+        return table.with_(**{key: own[key] for key in of_grade})
 
     @property
     def uncertain_of_magnet(self) -> tuple[Uncertain, ...]:

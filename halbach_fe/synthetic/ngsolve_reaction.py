@@ -70,6 +70,9 @@ class Elements:
     """Polynomial order of the potential; by default 3 in three dimensions and 5 in two."""
     grading: float = 0.3
     """Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast)."""
+    mirrored: tuple[int, int, int] = (0, 0, 0)
+    """How the potential of a magnet changes if x, y or z is mirrored: 1 if it is the same, -1 if it
+    changes its sign, 0 if nothing is known. What is mirrored is not meshed."""
 
 
 def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None = None) -> Floats:
@@ -83,7 +86,15 @@ def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None
     with import_extra("ngsolve").TaskManager():
         mesh = mesh_of(magnet, points, elements)
         potential = solve_potential(magnet, mesh, elements.order or {2: 5, 3: 3}[size])
-        places, moments = _response(magnet, mesh, potential, points[:, :size])
+        mirrored = np.flatnonzero(elements.mirrored)
+        near = points[:, :size].copy()
+        near[:, mirrored] = np.abs(near[:, mirrored])
+        places, moments = _response(magnet, mesh, potential, near)
+    for axis in mirrored:
+        sign = np.full(size, float(elements.mirrored[axis]))
+        sign[axis] *= -1  # -grad psi
+        flip = np.where(np.arange(size) == axis, -1.0, 1.0)
+        places, moments = np.vstack([places, flip * places]), np.vstack([moments, sign * moments])
     field = np.zeros((len(points), 3))
     field[:, :size] = moment_field(places, moments, points[:, :size])
     return field
@@ -234,6 +245,7 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     else:
         world = occ.Sphere(occ.Pnt(0, 0, 0), far)
         world.faces.name = "far"
+        world, *parts = _meshed_part([world, *parts], elements.mirrored, 2 * far)
     air = world - occ.Glue(parts)
     _name(air, "air", flat)
     geometry = occ.OCCGeometry(occ.Glue([*parts, air]), dim=magnet.dimension)
@@ -244,6 +256,27 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
         raise CheckFailedError(f"Netgen cannot mesh the bodies of the magnet: {error}") from None
     mesh.Curve(3)
     return mesh
+
+
+def _meshed_part(solids: list[Any], mirrored: tuple[int, int, int], far: float) -> list[Any]:
+    """Return what lies where mirrored coordinates are positive, of solids that end before ``far``.
+
+    The faces on which the potential vanishes, as it changes its sign there, are named as the outer
+    boundary is.
+    """
+    occ = import_extra("netgen.occ")
+    if not any(mirrored):
+        return solids
+    lowest = [0.0 if each else -far for each in mirrored]
+    kept = occ.Box(occ.Pnt(*lowest), occ.Pnt(far, far, far))
+    solids = [part for part in (solid * kept for solid in solids) if len(part.solids)]
+    for part in solids:
+        for face in part.faces:
+            middle = (face.center.x, face.center.y, face.center.z)
+            if any(sign < 0 and value < 1e-9 * far  # nothing is left at negative values
+                   for sign, value in zip(mirrored, middle, strict=True)):
+                face.name = "far"
+    return solids
 
 
 def _name(shape: Any, name: str, flat: bool) -> None:

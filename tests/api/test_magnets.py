@@ -91,6 +91,19 @@ def test_magnets_go_to_magpylib_and_back():
     assert magnet.field_T(POINTS) != pytest.approx(sources.getB(POINTS), abs=1e-4)
 
 
+def test_the_field_of_many_permeable_blocks_is_that_of_solve(generator):
+    """Closed forms, not expansions, which the many points of iron have: of these 72 cubes they are
+    up to 2.8e-5 of the field off in the bore, 6e-6 rms, and ppm matter in homogeneous magnets.
+    """
+    magnet = hf.halbach_ring(1, 12, inner_radius_m=0.06, outer_radius_m=0.075, length_m=0.12,
+                             rings=6, remanence_T=1.3, recoil_permeability=1.05, shape="cuboid")
+    points = generator.uniform(-0.025, 0.025, (200, 3))
+    solved = hf.solve(magnet.with_(observation__positions={
+        "kind": "points", "points_m": points.tolist()}))
+    size = np.linalg.norm(solved.flux_density, axis=1).mean()
+    assert np.abs(magnet.field_T(points) - solved.flux_density).max() < 1e-9 * size
+
+
 def test_what_magpylib_leaves_out_is_said():
     ring = hf.halbach_ring(blocks=4, inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
     assert hf.to_magpylib(ring)  # control: permeability 1, and nothing else; warnings are errors

@@ -23,6 +23,7 @@ from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
 from tests.conftest import ROOT
@@ -64,6 +65,54 @@ def test_vacuum_against_magpylib(short_dipole, session):
     np.testing.assert_allclose(found.along, expected, atol=1e-5 * scale)
     wrong_axis = along(found, np.cross([0.0, 0.0, 1.0], strength))
     assert np.abs(found.along - wrong_axis).max() > 0.1 * scale
+
+
+def cubes_of(materials, array_material, **changes):
+    """Cubes of several grades that are a metre apart, so that each is as if it were alone."""
+    count = len(materials)
+    return build_magnet(parse_study({
+        "name": "cubes", "mesh": {"block_size_m": 0.01}, "array": {
+            "material": array_material, "free_blocks": {
+                "name": [f"b{number}" for number in range(count)], "material": materials,
+                "shape": ["cuboid"] * count, "x_m": [0.05] * count, "y_m": [0.0] * count,
+                "z_m": list(map(float, range(count))),
+                **{f"size_{axis}_m": [0.02] * count for axis in "xyz"}}},
+        "demagnetization": {"temperature_C": 80.0} | changes,
+        "observation": {"quantity": "flux_density", "positions": {
+            "kind": "points", "points_m": [[0, 0, 0]]}}}))
+
+
+@pytest.mark.parametrize("of_array", ["N42SH", "N42"])
+def test_every_block_by_its_own_grade(session, of_array):
+    """N42 is past the knee in 7.5 % of a cube at 80 °C and N42SH nowhere: neither the grade of the
+    array nor the mean of both says so. What the table states otherwise than it holds for all.
+    """
+    both = demagnetization_map(cubes_of(["N42SH", "N42"], of_array), session)
+    alone = [demagnetization_map(cubes_of([name], name), session) for name in ("N42SH", "N42")]
+    assert alone[1].share_beyond_now > 0.05 > 1e-3 > alone[0].share_beyond_now
+    for own, row in zip(alone, both.by_block(), strict=True):
+        (expected,) = own.by_block()
+        for key in ("share_beyond_knee", "margin_A_per_m", "needed_coercivity_A_per_m"):
+            # places in cells differ from one map to the other: 1e-3 of the volume is measured
+            assert row[key] == pytest.approx(expected[key], rel=0.01, abs=5e-3), key
+    assert both.limit_temperature(0.0) == pytest.approx(alone[1].limit_temperature(0.0), abs=1)
+    for temperature in (60.0, 100.0):
+        shares = [float(one.share_beyond(np.array([temperature]))[0]) for one in alone]
+        assert both.share_beyond(np.array([temperature])) == pytest.approx(
+            np.mean(shares), abs=5e-3)
+    said = str(page(both).sections[0])
+    assert "; of other blocks at |H| = " in said
+    hard = demagnetization_map(cubes_of(["N42SH", "N42"], of_array,
+                                        intrinsic_coercivity_A_per_m=2e6), session)
+    assert hard.share_beyond_now == 0
+    assert len(hard.kinds) == 2  # their coefficients stay their own
+
+
+def test_grades_that_one_map_cannot_have(session):
+    """One without coefficients, and ferrite beside others."""
+    for name, sentence in (("N42UH", "coefficient_per_K"), ("Y30", "all of ferrite or none")):
+        with pytest.raises(StudyError, match=sentence):
+            demagnetization_map(cubes_of(["N42SH", name], "N42SH"), session)
 
 
 def test_more_cells_than_fit_into_memory_are_refused(monkeypatch):

@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 import scipy.stats as stats
 import xarray as xr
+from scipy.stats import qmc
 
 from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.blocks import rotation_about_z
+from halbach_fe.geometry.free_blocks import blocks_of_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks, with_types
 from halbach_fe.inference.infer import infer
@@ -136,6 +138,53 @@ def test_demagnetizing_tensor_of_a_sector(short_dipole):
     assert np.trace(tensor) == pytest.approx(1, abs=1e-9)  # of any block
     side = 2 * np.pi / 16 * 0.14525
     assert abs(aharoni(side, 0.08, 0.0825) - tensor[0, 0]) > 5 * QUADRATURE
+
+
+SIDE = 0.012  # m, from the middle of polygons to their corners
+ROUND = {"radius_m": SIDE}, lambda x, y: np.hypot(x, y) < SIDE
+
+
+def polygon(sides):
+    """Return the columns of a polygon, and which points are in it."""
+    middles = np.pi / sides * (2 * np.arange(sides) + 1)
+    return {"sides": sides, "radius_m": SIDE}, lambda x, y: (
+        np.outer(x, np.cos(middles)) + np.outer(y, np.sin(middles))
+        < SIDE * np.cos(np.pi / sides)).all(axis=1)
+
+
+def hull(columns, height):
+    """Return magpylib's prism on a regular polygon."""
+    angle = 2 * np.pi * np.arange(columns["sides"]) / columns["sides"]
+    points = [(SIDE * np.cos(a), SIDE * np.sin(a), z) for z in (-height / 2, height / 2)
+              for a in angle]
+    return magpylib.magnet.TriangularMesh.from_ConvexHull(points=points, polarization=(0, 0, 1))
+
+
+@pytest.mark.parametrize(("shape", "columns", "contains", "source"), [
+    ("polygon", *polygon(3), hull), ("polygon", *polygon(6), hull), ("polygon", *polygon(8), hull),
+    ("cylinder", *ROUND, lambda columns, height: magpylib.magnet.Cylinder(
+        dimension=(2 * SIDE, height), polarization=(0, 0, 1))),
+    ("sector", {"inner_radius_m": SIDE / 2, "outer_radius_m": SIDE, "angle_deg": 270.0},
+     lambda x, y: (np.hypot(x, y) < SIDE) & (np.hypot(x, y) > SIDE / 2) & (x > -np.abs(y)),
+     lambda columns, height: magpylib.magnet.CylinderSegment(
+         dimension=(SIDE / 2, SIDE, height, -135, 135), polarization=(0, 0, 1)))])
+def test_demagnetizing_tensor_of_other_outlines(shape, columns, contains, source):
+    """Against magpylib's H averaged over scattered points: outlines have three to eight edges.
+
+    The points leave 6e-4. With the part between the second and the fourth edge in place of the
+    whole, the tensor was 0.05 to 0.25 off, and measured blocks of permeability 1.05 up to 1.3 %.
+    """
+    height = 0.02
+    block, = blocks_of_table({
+        "name": ["a"], "shape": [shape], "x_m": [0.05], "y_m": [0.01], "z_m": [0.0],
+        "rotation_z_deg": [20.0], "size_z_m": [height], "remanence_T": [1.3],
+        **{name: [value] for name, value in columns.items()}})
+    (tensor,) = demagnetizing_tensors([block])
+    x, y, z = (qmc.Sobol(3, seed=1).random(2**14).T - 0.5) * [[2 * SIDE], [2 * SIDE], [height]]
+    points = np.column_stack([x, y, z])[contains(x, y)]
+    mean = MU_0 * source(columns, height).getH(points).mean(axis=0)
+    assert tensor[2, 2] == pytest.approx(-mean[2], abs=2 * QUADRATURE)
+    assert np.trace(tensor) == pytest.approx(1, abs=1e-9)
 
 
 @pytest.mark.parametrize(("along", "across", "error"), [(1.05, 1.15, 3e-4), (1.3, 1.3, 3e-3)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import re
 
+import magpylib
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from halbach_fe.api import homogeneity
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR, not_carried
+from halbach_fe.magnets import halbach_ring, to_magpylib
 from halbach_fe.measurement.field_map import field_map, total_field_map
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.report.homogeneity import answer
@@ -184,6 +186,29 @@ def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
     assert found.map_misfit > POOR
     write_report(found, tmp_path / "page")
     assert "times the stated noise" in (tmp_path / "page" / "homogeneity.html").read_text()
+    assert "times the stated noise" in answer(found).said  # which the terminal shows, too
+
+
+@pytest.mark.parametrize("coils", [(), ({"kind": "round", "radius_m": 0.03, "current_A": 500.0},)])
+def test_the_sphere_that_sources_leave_free(generator, tmp_path, coils):
+    """Thin rings lie between two shells that are tried, and a coil is no body: the fit took the
+    whole field to be free, and found 440 times the noise.
+    """
+    blocks = halbach_ring(blocks=12, inner_radius_m=0.0525, outer_radius_m=0.0675, length_m=0.03,
+                          rings=2, shape="cuboid").with_(array__ring_gap_m=0.025)
+    magnet = blocks.with_(external={"coils": list(coils)},
+                          noise={"regions": [{"name": "all", "sigma_T": 2e-6}]})
+    grid = GRID[np.linalg.norm(GRID, axis=1) < 0.042] / 2
+    field = magpylib.getB([to_magpylib(blocks), *(magpylib.current.Circle(
+        diameter=0.06, current=500.0) for _ in coils)], grid, sumup=True)
+    found = homogeneity(magnet, Session.open(tmp_path), Region.sphere(0.015), data=field_map(
+        grid, field + 2e-6 * generator.standard_normal(field.shape)))
+    assert found.map_misfit == pytest.approx(1, abs=0.1)  # of 1000 readings: 2 % is one sd
+    known, exact = found.of_map[MAP], found.by_name["prior"]
+    assert known.mean_T == pytest.approx(exact.mean_T, abs=4 * known.mean_sd_T)
+    score = [(each.ppm - true.ppm) / each.sd_ppm for each, true in zip(
+        known.harmonics, exact.harmonics, strict=True)]
+    assert np.sqrt(np.mean(np.square(score))) < 1.6  # as for the three rings above
 
 
 def test_a_held_out_part_that_is_too_small(generator, tmp_path, errors):

@@ -183,6 +183,43 @@ def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path
     assert "diagnose DIR/study.registered.toml" in answer([unexplained], assumed=far).command
 
 
+SAG_M, NEIGHBOUR_M = 1e-4, 0.08
+
+
+@pytest.mark.parametrize(("keys", "amplitudes"), [
+    (f'[[uncertain]]\nname = "sag"\nsd = {SAG_M}\nchange = {{"instrument.arm_sag_m" = 1.0}}', 1),
+    (f"[[external.neighbours]]\nz_m = {NEIGHBOUR_M}", 0)])
+def test_what_the_study_leaves_open_beside_its_blocks_is_in_the_bars(
+    magnet, generator, tmp_path, keys, amplitudes
+):
+    """The arm sags by the standard deviation that is stated, or the blocks of a neighbour deviate
+    by that of the prior, of which magpylib knows. Control: none of it is open, and the pose is off
+    by many of its error bars: one stands on the sag, or on the nominal neighbour.
+    """
+    study = parse_study(tomllib.loads(f"{TEXT}\n{keys}"))
+    middle = np.array([0.0, 0.0, 0.045])
+    places = GRID - middle
+    places[:, 1] -= amplitudes * SAG_M * (GRID[:, 2] / GRID[:, 2].max())**2
+    field = truth(generator).getB(places)
+    if not amplitudes:
+        field += truth(generator).getB(places - [0.0, 0.0, NEIGHBOUR_M])
+    data = field_map(GRID, field + NOISE_T * generator.standard_normal(field.shape))
+
+    def distances(of):
+        best = register(of, data, Session.open(tmp_path))[0]
+        return best, np.abs(np.concatenate([
+            (best.middle_m - GRID.mean(axis=0) + middle) / best.translation_sd_m,
+            turn_from_axes(best.instrument) / best.rotation_sd_rad]))
+
+    best, off = distances(build_magnet(study))
+    assert best.at_rest
+    assert best.chi2 < 1.2  # of 1200 readings: 1 +- 0.04
+    assert off.max() < 4
+    known = build_magnet(study.with_(uncertain=())) if amplitudes else magnet
+    best, off = distances(known)
+    assert off.max() > 20
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_signs_that_are_all_reversed(magnet, generator, tmp_path, sign):
     """They look like half a turn, which reverses this magnet's field. Control: the right signs."""

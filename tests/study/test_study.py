@@ -480,3 +480,19 @@ def test_lines_that_toml_does_not_allow(tmp_path, line, said):
     path.write_text(tomlkit.dumps(DIPOLE) + f"\n{line}\n")
     with pytest.raises(StudyError, match=said):
         read_study(path)
+
+
+def test_what_is_uncertain_of_the_instrument_of_a_map(dipole):
+    """The study of one map has what an amplitude changes of its own instrument, which is that of
+    the study if it states none.
+    """
+    study = dipole(
+        maps=[{"name": "body", "file": "a.csv"},
+              {"name": "fringe", "file": "b.csv", "instrument": {"z_scale": 0.01}}],
+        uncertain=[{"name": "scale", "sd": 1e-3, "change": {
+            "instrument.z_scale": 1.0, "maps[2].instrument.z_scale": 2.0}},
+            {"name": "weak", "sd": 0.01, "change": {"array.remanence_T": 1.0}}])
+    for number, change in enumerate((1.0, 2.0)):
+        first, second = study.of_map(number).uncertain
+        assert first.change == {"instrument.z_scale": change}
+        assert second == study.uncertain[1]

@@ -240,3 +240,22 @@ def test_readings_nearer_to_iron_than_its_elements(near, fails, monkeypatch):
     monkeypatch.setattr(ngsolve_reaction, "KDTree", near)
     coarse = ngsolve_reaction.reaction_field(magnet, points, Elements(size=0.01))
     assert (np.abs(coarse - truth).max() > 0.4 * np.abs(truth).max()) == fails
+
+
+@pytest.mark.parametrize(("mirrored", "right"), [((1, -1, -1), True), ((1, 1, -1), False)])
+def test_an_eighth_of_a_symmetric_magnet(mirrored, right):
+    """Two cuboids magnetized along z, one against the other, between four poles: the potential is
+    even in x and odd in y and z. 0.4 % of the largest field were measured, from two meshes.
+    """
+    blocks = {"name": ["above", "below"], "shape": ["cuboid"] * 2, "x_m": [0.0] * 2,
+              "y_m": [0.02, -0.02], "z_m": [0.0] * 2, "recoil_permeability": [1.1] * 2,
+              "remanence_x_T": [0.0] * 2, "remanence_y_T": [0.0] * 2, "remanence_z_T": [1.2, -1.2],
+              **{f"size_{axis}_m": [0.016] * 2 for axis in "xyz"}}
+    magnet = magnet_of(study_with(
+        {"kind": "box", "size_m": [0.016, 0.016, 0.006], "centre_m": [0.0, 0.02, 0.012],
+         "mirrored": ["y", "z"]}, array={"free_blocks": blocks}))
+    points = np.array([[x, y, z] for x in (-0.004, 0.003) for y in (-0.005, 0.002, 0.006)
+                       for z in (-0.01, 0.0, 0.004)])
+    whole, eighth = (ngsolve_reaction.reaction_field(magnet, points, Elements(
+        size=0.004, mirrored=each)) for each in ((0, 0, 0), mirrored))
+    assert (np.abs(eighth - whole).max() < 0.01 * np.abs(whole).max()) == right

@@ -16,7 +16,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
-from halbach_fe.geometry.outline import Edge, Outline, at_heights
+from halbach_fe.geometry.outline import Edge, Outline, at_heights, outline_centroid
 
 CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
@@ -201,26 +201,13 @@ def area_and_centroid(polygons: Floats) -> tuple[Floats, Floats]:
     return area, origin[:, 0] + centroid / area[:, None]
 
 
-def _outline_centroid(block: MagnetBlock) -> Floats:
-    """Return the centroid (2,) in m of an outline by Green's theorem.
-
-    The quadrature is exact on straight edges, and to rounding on arcs.
-    """
-    t, weight = np.polynomial.legendre.leggauss(16)
-    total = np.zeros(2)
-    for edge in block.outline:
-        points, normals = edge.at((t + 1) / 2)
-        total += np.sum(weight[:, None] / 4 * points**2 * normals, axis=0)
-    return total / block.area
-
-
 def _scale_to_outline(quads: Floats, block: MagnetBlock) -> Floats:
     """Scale and move quadrilaterals (k, 4, 2) to the area and the centroid of an outline."""
     if not any(edge.arc for edge in block.outline):
         return quads
     areas, middles = area_and_centroid(quads)
     middle = areas @ middles / areas.sum()
-    return (quads - middle) * np.sqrt(block.area / areas.sum()) + _outline_centroid(block)
+    return (quads - middle) * np.sqrt(block.area / areas.sum()) + outline_centroid(block.outline)
 
 
 def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:

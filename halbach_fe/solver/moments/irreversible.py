@@ -47,10 +47,10 @@ what is lost along the edges."""
 
 @dataclass(frozen=True)
 class KneeLaw:
-    """A demagnetization curve with a knee."""
+    """A demagnetization curve with a knee, or those of cells (n,) of several materials."""
 
-    coercivity_T: float
-    """mu_0 H_cJ."""
+    coercivity_T: float | Floats
+    """mu_0 H_cJ. Shape () or (n,)."""
     squareness: float
     """Ratio of H_k, where a tenth of the remanence is lost, to H_cJ; below 1."""
 
@@ -62,20 +62,22 @@ class KneeLaw:
         return cls(MU_0 * material.intrinsic_coercivity_A_per_m * (1 + change),
                    material.squareness)
 
-    @property
-    def width_T(self) -> float:  # noqa: N802 - a unit
-        """The width w in T."""
+    def _at(self, field: Floats) -> tuple[Floats, Floats]:
+        """Return the coercivity and the width w in T for fields (n, ...) of the cells."""
         # part of the remanence that is left at the knee, by the definition of H_k in IEC 60404-8-1
         at_knee = 0.9
-        return self.coercivity_T * (1 - self.squareness) / (2 * float(np.arctanh(at_knee)))
+        own = np.asarray(self.coercivity_T)
+        own = own.reshape(own.shape + (1,) * (np.ndim(field) - own.ndim))
+        return own, own * (1 - self.squareness) / (2 * float(np.arctanh(at_knee)))
 
     def kept(self, field: Floats) -> Floats:
         """Return the part p of the remanence that is left at mu_0 H . u = ``field``, in T."""
-        return np.tanh((field + self.coercivity_T) / (2 * self.width_T))
+        coercivity, width = self._at(field)
+        return np.asarray(np.tanh((field + coercivity) / (2 * width)))
 
     def slope(self, field: Floats) -> Floats:
         """Return the derivative of `kept` in 1/T."""
-        return (1 - self.kept(field)**2) / (2 * self.width_T)
+        return np.asarray((1 - self.kept(field)**2) / (2 * self._at(field)[1]))
 
     def kept_in_tubes(self, field: Floats, strength: Floats, mean: Floats) -> tuple[Floats, Floats]:
         """Return the part p that is left where a loss raises the field, and dp / dfield in 1/T.

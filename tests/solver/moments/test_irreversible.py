@@ -10,8 +10,12 @@ import pytest
 from scipy.optimize import brentq, root
 
 from halbach_fe.core.errors import StudyError
+from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
 from halbach_fe.solver.moments.solve import System
+from halbach_fe.solver.separate_blocks import solve_separate
+from halbach_fe.solver.session import Session
+from halbach_fe.study.grades import grade
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
@@ -148,6 +152,25 @@ def test_what_contradicts_losses_is_refused():
                               "squareness")):
         with pytest.raises(StudyError, match=sentence):
             parse_study(STUDY | change)
+
+
+def test_losses_of_cubes_of_two_grades():
+    """Far apart, each loses what it loses alone by its own coercivity."""
+    magnet = magnet_of_blocks({
+        "shape": ["cuboid"] * 2, "x_m": [0.0, 100 * SIDE], "y_m": [0.0] * 2, "z_m": [0.0] * 2,
+        "material": ["N42SH", "N42"], **{f"size_{axis}_m": [SIDE] * 2 for axis in "xyz"}})
+    study = magnet.study.with_(array__material="N42SH", demagnetization=Demagnetization(
+        **grade("N42SH").demagnetization_defaults, temperature_C=120.0, irreversible=True))
+    points = np.array([[0.0, 0.0, 2 * SIDE], [100 * SIDE, 0.0, 2 * SIDE]])
+    both = solve_separate(magnet.with_study(study), Session.temporary()).field(points)
+    for number, name in enumerate(("N42SH", "N42")):
+        alone = {of: solve_irreversible(System.of([magnet.blocks[number]]), KneeLaw.of(
+            study.demagnetization.with_(**grade(of).demagnetization_defaults)))[0].reaction(points)
+            for of in ("N42SH", "N42")}
+        # the field of the other cube, 100 sides away, is 1e-6 T
+        assert both[number] == pytest.approx(alone.pop(name)[number], abs=1e-5)
+        (other,) = alone.values()
+        assert np.abs(both[number] - other[number]).max() > 1e-3
 
 
 def test_newtons_steps_are_few(cube):
