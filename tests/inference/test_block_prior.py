@@ -20,8 +20,8 @@ from scipy.stats import qmc
 
 from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.geometry.array_layout import blocks_of_table
 from halbach_fe.geometry.blocks import rotation_about_z
-from halbach_fe.geometry.free_blocks import blocks_of_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks, with_types
 from halbach_fe.inference.infer import infer
