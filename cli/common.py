@@ -470,7 +470,7 @@ def finish(arguments: argparse.Namespace, result: object) -> int:
     return 0
 
 
-def say_page(arguments: argparse.Namespace, page: Page, path: Path | None = None) -> None:
+def say_page(arguments: argparse.Namespace, page: Page, path: Path | None) -> None:
     """Print the tables and the answer of a page, and where it is if it was written."""
     for sentence in filter(None, page.remarks):
         say(sentence)
@@ -481,7 +481,7 @@ def say_page(arguments: argparse.Namespace, page: Page, path: Path | None = None
     say_answer(arguments, page.answer, path)
 
 
-def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None = None) -> None:
+def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None) -> None:
     """Say the answer of a command, the command to go on with, and where its page is."""
     named = answer.with_paths(_paths_of(arguments))
     for sentence in named.sentences:

@@ -64,7 +64,7 @@ NO_VALUE = re.compile(rb'<c r="([A-Z]{1,3}\d{1,7})"(?![^>]*t="str")[^>]*>\s*'
 """A cell of a workbook with a formula of a number and without its value when it was saved."""
 
 
-def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, list[str]]:
+def sheet_text(raw: bytes, decimal_comma: bool) -> tuple[bytes, str, list[str]]:
     """Return a sheet of an Excel workbook (.xlsx) as CSV in UTF-8, its name, and those of others.
 
     It is the first one with two rows of numbers, else the first with cells; the others are all

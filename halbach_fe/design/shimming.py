@@ -420,7 +420,7 @@ def check_shimming(study: Study) -> None:
 
 
 def check_stock(
-    magnet: Magnet, stock: BlockTable, mounted: Collection[str] | None = None
+    magnet: Magnet, stock: BlockTable, mounted: Collection[str] | None
 ) -> None:
     """Refuse a stock whose blocks do not fit the magnet, or stand in it already.
 

@@ -167,7 +167,7 @@ def find_gross_errors(
     return tuple(found)
 
 
-def misfit_of(study: Study, data: xr.Dataset, iron: Field | None = None) -> float:
+def misfit_of(study: Study, data: xr.Dataset, iron: Field | None) -> float:
     """Return the rms difference of a map from the nominal magnet, relative to the map's rms.
 
     Infinite if the study places points of the map inside material.

@@ -461,7 +461,7 @@ def _added(noise: NoiseSettings | None, sd_m: float) -> NoiseSettings:
 
 
 def compare_noise_models(
-    root: Floats, residual: Floats, per_displacement: sparse.csr_array, current_sd_m: float = 0.0,
+    root: Floats, residual: Floats, per_displacement: sparse.csr_array, current_sd_m: float,
 ) -> PositionNoise:
     """Compare the evidence of whitened readings with and without position noise.
 

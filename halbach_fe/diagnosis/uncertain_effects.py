@@ -90,7 +90,7 @@ def can_be_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
 
 
 def _rivals(
-    effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect] = ()
+    effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect]
 ) -> list[IdentifiedEffect]:
     """Return all rivals of some effects, and what is suspected, that are none of these.
 

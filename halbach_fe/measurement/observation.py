@@ -188,7 +188,7 @@ def concatenate(first: Observation, second: Observation) -> Observation:
 
 
 def observe_total(
-    study: Study, points: Floats, measured: NDArray[np.bool_], directions: Floats | None = None,
+    study: Study, points: Floats, measured: NDArray[np.bool_], directions: Floats | None,
     where: str = "map",
 ) -> Observation:
     """Return the observation of |B| at the points of a map, linear about fields of known direction.
@@ -202,7 +202,7 @@ def observe_total(
         Positions as the map states them.
     measured : ndarray of bool, shape (n,)
         Whether the map holds |B| at a point.
-    directions : ndarray, shape (n, 3), optional
+    directions : ndarray, shape (n, 3), or None
         Unit vectors of the field, as a probe of three components would show it. Without them, the
         three components are observed in place of each |B|.
     where : str

@@ -177,7 +177,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
 
 
 def sections_of_circles(
-    tables: Sequence[MultipoleTable], study: Study, origin: str, error: str = "",
+    tables: Sequence[MultipoleTable], study: Study, origin: str, error: str,
     warning: Sequence[Text] = (),
 ) -> list[Section]:
     """Return what a page says of the multipoles of full circles; nothing without any.

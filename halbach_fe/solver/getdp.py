@@ -174,7 +174,7 @@ NO_GETDP = GetDP(Path(), "none", (), "")
 """Stands for GetDP where it is not installed; only a run that needs GetDP refuses it."""
 
 
-def getdp_or_none(named: str | Path | None = None) -> GetDP:
+def getdp_or_none(named: str | Path | None) -> GetDP:
     """Return the GetDP of `find_getdp`, or `NO_GETDP` if none was named and none is installed.
 
     What has a closed form needs no GetDP.

@@ -403,7 +403,7 @@ def assembled(
 
 
 def points_at(
-    mesh: VerifiedMesh, located: Located, unknowns: Unknowns, anywhere: bool = False
+    mesh: VerifiedMesh, located: Located, unknowns: Unknowns, anywhere: bool
 ) -> GaussPoints:
     """Return the operators at located points in air, or ``anywhere``, without weights."""
     operators = nodal_operators if anywhere else grid_operators

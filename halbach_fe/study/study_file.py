@@ -376,7 +376,7 @@ def new_study(
     return text
 
 
-def _sphere(radius: float, flat: bool = False) -> list[str]:
+def _sphere(radius: float, flat: bool) -> list[str]:
     """Return points on a sphere about the origin as TOML, a line for each of Gauss' latitudes.
 
     If ``flat``, of a cross-section, they are those of the equator alone.

@@ -129,7 +129,7 @@ def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
     return replace(file, remarks=(*file.remarks, remark))
 
 
-def with_positions(table: ForeignTable, path: Path, length_unit: str = "") -> ForeignTable:
+def with_positions(table: ForeignTable, path: Path, length_unit: str) -> ForeignTable:
     """Return a table of readings with the columns x, y and z of a file of positions.
 
     The user may state the ``length_unit`` of those that have none.

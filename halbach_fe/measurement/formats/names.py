@@ -183,7 +183,7 @@ def _words(base: str) -> list[str]:
 
 
 def with_polar(
-    columns: Sequence[ColumnName], constant: Collection[str] = ()
+    columns: Sequence[ColumnName], constant: Collection[str]
 ) -> tuple[ColumnName, ...]:
     """Return the columns, of which theta beside phi is the angle from the z axis, and Btheta the
     component along it. Without phi theta is the angle about z.

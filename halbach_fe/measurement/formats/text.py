@@ -184,7 +184,7 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
         return [line]
 
 
-def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
+def number_in_cell(cell: str, decimal_comma: bool) -> float:
     """Return the number in a cell, NaN if it says that there is none; else raise ValueError."""
     if cell.lower() in MISSING:
         return np.nan

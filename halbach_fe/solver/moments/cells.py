@@ -210,7 +210,7 @@ def _scale_to_outline(quads: Floats, block: MagnetBlock) -> Floats:
     return (quads - middle) * np.sqrt(block.area / areas.sum()) + outline_centroid(block.outline)
 
 
-def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:
+def quadrilaterals(outline: Outline, size: float, least: int) -> Floats:
     """Cut an outline into convex quadrilaterals (k, 4, 2) of sides of about ``size``, in m.
 
     A four-sided outline has at least ``least`` of them along either direction; a convex polygon
