@@ -136,7 +136,7 @@ def _generate(name: str, shell: Shell) -> None:
         bent = _straightened(shell)
         if bent is None:
             return
-    x, y, z = bent
+        x, y, z = bent
     raise MeshError(
         f"Gmsh could not mesh the iron of study '{name}' near ({x:.5g}, {y:.5g}, {z:.5g}) m: "
         "its curved sides turn an element inside out. Were other units meant there? Otherwise "
