@@ -34,6 +34,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.block_variation import neighbour_deviations
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
@@ -262,7 +263,7 @@ OF_LINES = "--from-m and --to-m"
 
 def field_on_lines(
     magnet: Magnet, lines: Lines, magnetizations: Gaussian, session: Session,
-    inside: bool = False
+    inside: bool = False, before: bool = False
 ) -> FieldOnLines:
     """Return B on lines for normally distributed magnetizations in A/m.
 
@@ -272,6 +273,8 @@ def field_on_lines(
         Of all parameters of the response matrix.
     inside : bool
         Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
+    before : bool
+        Whether this is before a map was read: then the blocks of neighbours deviate, too.
 
     Raises
     ------
@@ -301,6 +304,11 @@ def field_on_lines(
                                 model.whole @ magnetizations.root]).reshape(len(points), 3, -1)
         error = weak = model.error
         polarization = np.zeros((lines.points[..., 0].size, 3, flux.shape[2]))
+    if before:
+        others = np.moveaxis(neighbour_deviations(magnet, points), 0, -1)
+        flux = np.concatenate([flux, others], axis=2)
+        polarization = np.concatenate([
+            polarization, np.zeros((*polarization.shape[:2], others.shape[2]))], axis=2)
     shape = lines.points.shape
     every, bars = (each.reshape(-1, *shape[1:], *each.shape[2:]) for each in (
         flux, error.reshape(-1, 3)))
