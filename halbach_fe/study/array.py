@@ -303,8 +303,7 @@ class Array(_OfGrade):
                 own = [with_grade(ring) if isinstance(ring, dict) else ring for ring in rings]
                 if all(any(_value(ring, key) is not None for key in strengths) for ring in own):
                     values |= {key: _value(own[0], key) for key in strengths}
-        elif free is not None and all(values.get(key) is None or values[key] == 0
-                                      for key in ("rings", "blocks_per_ring", "block")):
+        elif free is not None and _is_empty(values):
             try:
                 table = FreeBlocks.model_validate(free)
             except ValidationError:  # reported by the validation of the key itself
@@ -402,6 +401,12 @@ class Array(_OfGrade):
         return type(self).model_validate(values)
 
 
+def _is_empty(array: dict[str, Any]) -> bool:
+    """Return whether an array says nothing of rings, so that it has none beside free blocks."""
+    return all(array.get(key) is None or array[key] == 0
+               for key in ("rings", "blocks_per_ring", "block"))
+
+
 def common_material(array: dict[str, Any]) -> str | None:
     """Return the grade of an array without one: of its first ring or block, if all name grades."""
     found = [name for name, _ in _materials(array)]
@@ -414,9 +419,8 @@ def remanence_sd(array: dict[str, Any]) -> float | None:
     of these; None if none does.
     """
     own = grade_of({"material": common_material(array)})
-    every = _materials(array) or [
-        (None, any(array.get(key) is not None for key in STRENGTHS))]
-    found = [grade_of({"material": name}) or own for name, is_stated in every if not is_stated]
+    found = [grade_of({"material": name}) or own for name, is_stated in _materials(array)
+             if not is_stated]
     return max((one.remanence_sd for one in found if one is not None), default=None)
 
 
@@ -427,6 +431,8 @@ def _materials(array: dict[str, Any]) -> list[tuple[str | None, bool]]:
     found = [(_value(ring, "material"), any(_value(ring, key) is not None for key in STRENGTHS) or (
         stated and not _value(ring, "material"))) for ring in rings] if isinstance(
             rings, list | tuple) else []
+    if not found and not (free is not None and _is_empty(array)):  # equal rings
+        found = [(array.get("material"), stated)]
     columns = {key: _value(free, key) or () for key in ("name", "material", *STRENGTHS)}
     if not all(isinstance(values, list | tuple) for values in columns.values()):
         return found  # reported by the validation of the key itself
