@@ -383,14 +383,17 @@ def _reaction_by_moments(
 
 
 def at_temperature(magnet: Magnet) -> Magnet:
-    """Return the magnet whose blocks have the remanence of their materials' temperature."""
+    """Return the magnet whose blocks have the remanence of their materials' temperature, and have
+    lost nothing: the map says where they would, also at other temperatures.
+    """
     factors = {block.place: float(remanence_factor(material, material.temperature_C))
                for block, material in zip(magnet.blocks, magnet.demagnetizations, strict=True)}
-    alike = len(set(factors.values())) == 1
-    return magnet.with_(array__exceptions=(*magnet.array.exceptions, *(
-        BlockException(magnetization_factor=factor, **({} if alike else {
-            "ring": ring, "slot": slot}))
-        for (ring, slot), factor in list(factors.items())[:1 if alike else None])))
+    weaker = [BlockException(ring=ring, slot=slot, magnetization_factor=factor)
+              for (ring, slot), factor in factors.items()]
+    if len(set(factors.values())) == 1:
+        weaker = [weaker[0].with_(ring=None, slot=None)]
+    return magnet.with_(demagnetization__irreversible=False,
+                        array__exceptions=(*magnet.array.exceptions, *weaker))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
