@@ -131,8 +131,8 @@ def _labelled(values: Any) -> Any:
         return values
     numbers = values.to_numpy()
     labels = [getattr(values, "index", ()), getattr(values, "columns", ())]
-    name = getattr(values, "name", None) if numbers.ndim == 1 else None  # no column of a table
-    return xr.DataArray(numbers, dims=("row", "column")[:numbers.ndim], name=name, coords={
+    own = getattr(values, "name", None) if numbers.ndim == 1 else None  # no column of a table
+    return xr.DataArray(numbers, dims=("row", "column")[:numbers.ndim], name=own, coords={
         name: [one if isinstance(one, Number) else str(one) for one in found]
         for name, found in zip(("row", "column")[:numbers.ndim], labels, strict=False)
         if len(found)})
@@ -152,7 +152,7 @@ def _by_labels(values: Any, axes: Sequence[str]) -> Any:
                                     *chain(*labels.values())) if OTHER_UNIT.search(text)]:
         raise ValueError(f"numbers in other units than m and T: {', '.join(scaled)}; convert them "
                          "and name them anew")
-    if len(axes) == 1 and (found := AXIS.match(own)) and found[1].lower() != axes[0]:
+    if len(axes) == 1 and (other := AXIS.match(own)) and other[1].lower() != axes[0]:
         raise ValueError(f"{own} in place of {axes[0]}; name it anew")
     for name in [*values.dims][::-1]:
         found = [AXIS.match(label) for label in labels.get(name, [])]
