@@ -553,7 +553,7 @@ def _nominal_strength(
     strength, error = np.zeros_like(points), np.zeros_like(points)
     strength[free] = external_field(magnet, points[free]) + field_of(magnet.blocks, points[free])
     if solved is not None:
-        reaction, error[free] = _reaction(magnet, points[free], number[free], solved)
+        reaction, error[free] = reaction_within(magnet, points[free], number[free], solved)
         strength[free] += reaction
         if solved.iron is not None and in_iron.any():
             strength[in_iron], error[in_iron] = solved.iron.inside(points[in_iron])
@@ -648,7 +648,7 @@ def _induced(body: IronSolid, strength: Floats) -> tuple[Floats, Floats]:
             np.maximum(1 + excess, 1 + excess + slope * square)[:, None])
 
 
-def _reaction(
+def reaction_within(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], solved: SeparateReaction
 ) -> tuple[Floats, Floats]:
     """Return what permeability and iron add to mu_0 H of the nominal magnet, and its error bar.
@@ -671,8 +671,9 @@ def _reaction(
 
     field, error = np.zeros_like(points), np.zeros_like(points)
     free = place < 0 if solved.blocks else np.ones(len(points), bool)
-    field[free], change = solved.field_with_errors(points[free])
-    error[free] = np.linalg.norm(change, axis=1, keepdims=True)
+    if free.any():
+        field[free], change = solved.field_with_errors(points[free])
+        error[free] = np.linalg.norm(change, axis=1, keepdims=True)
     for block in set(place[~free]):
         here = place == block
         strength, bar = field_within(solved.blocks[0], block, present[block], points[here], sources)
