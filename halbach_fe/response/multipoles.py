@@ -820,14 +820,22 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
             f"{radius:g}",
             "Was it meant in millimetres?" if radius / 1000 <= most_radius * bore < radius / 10
             else "Choose a smaller one." if radius > most_radius * bore else ""))
+    if reference.z_m is not None:
+        free = _free_radius(magnet, reference.z_m, 0.0)
+    if radius > free:
+        raise StudyError(must_be(
+            "--reference-radius-m", f"study {magnet.name}", f"at most {free:.4g} m, where iron "
+            "begins: a circle around iron has no multipoles", f"{radius:g}",
+            "Only a field about a free axis has multipoles; halbach-fe solve computes this one at "
+            "any points."))
     return radius
 
 
-def _free_radius(magnet: Magnet, z: float | None) -> float:
+def _free_radius(magnet: Magnet, z: float | None, beside: float = np.inf) -> float:
     """Return the radius in m about the axis within which there are neither blocks nor iron.
 
     Poles of iron may stand nearer to the axis than the blocks. Beside a circle at ``z`` only those
-    count that are nearer to it along z than the blocks are to the axis.
+    count that are nearer to it along z than the blocks are to the axis, and than ``beside`` in m.
     """
     bore = magnet.bore_radius
     bodies = [body for body in magnet.iron if not body.is_coaxial or body.inner_radius < bore]
@@ -838,7 +846,7 @@ def _free_radius(magnet: Magnet, z: float | None) -> float:
         ends = [(body.surface[2].min(), body.surface[2].max()) for body in bodies]
         heights = np.unique(np.concatenate([np.linspace(*each, 9) for each in ends]))
         if z is not None:
-            heights = np.append(heights[np.abs(heights - z) < bore], z)
+            heights = np.append(heights[np.abs(heights - z) < min(bore, beside)], z)
     angle = 2 * np.pi * np.arange(720) / 720
     circles = np.column_stack([np.tile(np.cos(angle), len(heights)),
                                np.tile(np.sin(angle), len(heights)), np.repeat(heights, 720)])
@@ -846,7 +854,9 @@ def _free_radius(magnet: Magnet, z: float | None) -> float:
     def is_free(radius: float) -> bool:
         return not any(body.contains(circles * [radius, radius, 1.0]).any() for body in bodies)
 
-    radii = np.linspace(0, bore, 65).tolist()
+    spans = [np.hypot(*body.surface[:2]) for body in bodies]
+    middles = [(span.min() + span.max()) / 2 for span in spans]  # of walls thinner than the steps
+    radii = np.unique([*np.linspace(0, bore, 65), *np.minimum(middles, bore)]).tolist()
     for free, beyond in pairwise(radii):
         if not is_free(beyond):
             for _ in range(12):
