@@ -6,7 +6,6 @@ import argparse
 import os
 import shlex
 import tomllib
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -92,69 +91,21 @@ def new(arguments: argparse.Namespace) -> int:
 
     The file is a valid study, and a comment explains every key.
     """
-    from halbach_fe.magnets import new_magnet
-    from halbach_fe.study.study_file import OUTER_RADIUS, MagnetTemplate, write_new_study
+    from halbach_fe.magnets import template_of, write_template
+    from halbach_fe.study.study_file import MagnetTemplate
 
     given = {name: value for name, value in vars(arguments).items()
              if name in MagnetTemplate.__dataclass_fields__ and value}
-    _check(given, arguments.radius_m)
-    if "cube_m" in given:
-        edge, radius = given["cube_m"], arguments.radius_m
-        given |= {"shape": "cuboid", "ring_length_m": edge,
-                  "inner_radius_m": round(radius - edge / 2, 9),
-                  "outer_radius_m": round(radius + edge / 2, 9)}
-    if "steel" in given:
-        given["iron_ring"] = True
-    inner = max([*given.get("inner_radii_m", ()), given.get("inner_radius_m", 0.0)])
-    if inner:
-        given.setdefault("outer_radius_m", round(OUTER_RADIUS * inner, 6))
-    path, folder = arguments.study, arguments.study.parent
+    path = arguments.study
     if "free_blocks" in given:
-        given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
-    magnet, template = new_magnet(MagnetTemplate(**given), path.stem, folder)
-    if template.dsv_m is not None:
-        from halbach_fe.response.homogeneity import region_points
-
-        # refuses one that is not in air
-        region_points(magnet, hf.Region.sphere(template.dsv_m / 2))
-    write_new_study(path, template)
+        given["free_blocks"] = os.path.relpath(given["free_blocks"], path.parent)
+    _, template = write_template(path, template_of(
+        given, "the command line", lambda key: f"--{key.replace('_', '-')}", CommandLineError))
     name = str(path) if not str(path).startswith("-") else f"./{path}"
     common.say(f"Wrote {path}. Its noise suits the field of the magnet: "
                f"{1e6 * template.sigma_T:g} µT for a reading, {1e6 * template.position_sd_m:g} µm "
                f"for a position. Next: halbach-fe solve {shlex.quote(name)} -o DIR")
     return 0
-
-
-def _check(given: Mapping[str, object], radius_m: float | None) -> None:
-    """Refuse options that the study would not show beside others."""
-    long = bool(given.keys() & {"ring_length_m", "cube_m", "free_blocks"})
-    rings, edge = given.get("rings"), given.get("cube_m")
-    follow = "Rings that follow each other along z have a length."
-    for without, beside, why in (
-            ("inner_radii_m" in given and "ring_length_m" not in given, "--inner-radii-m", follow),
-            (isinstance(rings, int) and rings > 1 and not long, "--rings", follow),
-            ("dsv_m" in given and not long, "--dsv-m", "A cross-section has no volume.")):
-        if without:
-            raise CommandLineError(must_be("--ring-length-m", "the command line",
-                                           f"given with {beside}", "nothing", why))
-    if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
-        raise CommandLineError(must_be(
-            "--cube-m", "the command line", f"less than twice --radius-m, {radius_m:g}, at which "
-            "the cubes have their middles", f"{edge:g}", "Both are in metres."))
-    if ("cube_m" in given) != (radius_m is not None):
-        raise CommandLineError(must_be(
-            "--radius-m", "the command line", "given together with --cube-m", "one of them",
-            "Cubes have their middles at this radius."))
-    of_table = given.keys() - {"free_blocks", "multipole_order", "iron_ring", "steel", "dsv_m"}
-    for name, others, why in (
-            ("free_blocks", of_table, "The table has it."),
-            ("inner_radii_m", given.keys() & {"rings"}, "There is a ring of each radius."),
-            ("cube_m", given.keys() & {"shape", "outer_radius_m", "ring_length_m"},
-             "The cube has it.")):
-        if name in given and others:
-            raise CommandLineError(must_be(
-                f"--{min(others).replace('_', '-')}", "the command line",
-                f"left out with --{name.replace('_', '-')}", "both", why))
 
 
 def _calibration(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ any of it, and `write_study` writes it down.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import check_options, typed
 from halbach_fe.core.arrays import rms
-from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
+from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.installation import import_extra
 from halbach_fe.core.numbers import check_number
@@ -29,6 +29,7 @@ from halbach_fe.geometry.array_layout import beside_blocks, blocks_table, free_o
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.homogeneity import Region, region_points
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import outline_of, validated_blocks, write_free_blocks
@@ -407,7 +408,8 @@ def new(path: str | Path, **values: object) -> Magnet:
     **values
         Those of the magnet that differ from the defaults: multipole_order, blocks_per_ring, rings,
         inner_radius_m, outer_radius_m, ring_length_m, remanence_T or material, shape, iron_ring,
-        steel, dsv_m and so on, as the options of ``halbach-fe new`` are named.
+        steel, cube_m with radius_m, dsv_m and so on, as the options of ``halbach-fe new`` are
+        named.
 
     Returns
     -------
@@ -426,10 +428,67 @@ def new(path: str | Path, **values: object) -> Magnet:
     >>> hf.new("quadrupole.toml", multipole_order=2, inner_radius_m=0.02).name
     'quadrupole'
     """
-    check_options(values, MagnetTemplate, "hf.new")
-    if "inner_radius_m" in values and "outer_radius_m" not in values:
-        values["outer_radius_m"] = round(OUTER_RADIUS * float(str(values["inner_radius_m"])), 6)
-    path = as_path(path)
-    magnet, template = new_magnet(MagnetTemplate(**values), path.stem, path.parent)  # type: ignore[arg-type]
+    check_options(values, MagnetTemplate, "hf.new", "sigma_T", "position_sd_m")
+    return write_template(as_path(path), template_of(values, "hf.new"))[0]
+
+
+def template_of(
+    values: Mapping[str, Any], where: str, named: Callable[[str], str] = str,
+    refusal: type[HalbachError] = StudyError,
+) -> MagnetTemplate:
+    """Return the template of some values, with what follows from them.
+
+    Raises
+    ------
+    StudyError
+        Or ``refusal``, if a value would be without effect beside others. ``named`` says how the
+        user calls it.
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    edge, radius, follow = given.get("cube_m"), given.get("radius_m"), (
+        "Rings that follow each other along z have a length.")
+    long = bool(given.keys() & {"ring_length_m", "cube_m", "free_blocks"})
+    for without, beside, why in (
+            ("inner_radii_m" in given and "ring_length_m" not in given, "inner_radii_m", follow),
+            (given.get("rings", 1) > 1 and not long, "rings", follow),
+            ("dsv_m" in given and not long, "dsv_m", "A cross-section has no volume.")):
+        if without:
+            raise refusal(must_be(named("ring_length_m"), where, f"given with {named(beside)}",
+                                  "nothing", why))
+    if (edge is None) != (radius is None):
+        raise refusal(must_be(named("radius_m"), where, f"given together with {named('cube_m')}",
+                              "one of them", "Cubes have their middles at this radius."))
+    of_table = given.keys() - {"free_blocks", "multipole_order", "iron_ring", "steel", "dsv_m"}
+    for name, others, why in (
+            ("free_blocks", of_table, "The table has it."),
+            ("inner_radii_m", given.keys() & {"rings", "inner_radius_m"},
+             "There is a ring of each radius."),
+            ("material", given.keys() & {"remanence_T"}, "The grade has it."),
+            ("cube_m", given.keys() & {"shape", "inner_radius_m", "outer_radius_m", "ring_length_m",
+                                       "inner_radii_m"}, "The cube has it.")):
+        if name in given and others:
+            raise refusal(must_be(named(min(others)), where, f"left out with {named(name)}",
+                                  "both", why))
+    if edge is not None and radius is not None:
+        if not edge < 2 * radius:
+            raise refusal(must_be(
+                named("cube_m"), where, f"less than twice {named('radius_m')}, {radius:g}, at "
+                "which the cubes have their middles", f"{edge:g}", "Both are in metres."))
+        given |= {"shape": "cuboid", "ring_length_m": edge,
+                  "inner_radius_m": round(radius - edge / 2, 9),
+                  "outer_radius_m": round(radius + edge / 2, 9)}
+    if "steel" in given:
+        given["iron_ring"] = True
+    inner = max([*given.get("inner_radii_m", ()), given.get("inner_radius_m", 0.0)])
+    if inner:
+        given.setdefault("outer_radius_m", round(OUTER_RADIUS * inner, 6))
+    return MagnetTemplate(**given)
+
+
+def write_template(path: Path, template: MagnetTemplate) -> tuple[Magnet, MagnetTemplate]:
+    """Write a new study file; return its magnet, and the template with the noise of its study."""
+    magnet, template = new_magnet(template, path.stem, path.parent)
+    if template.dsv_m is not None:  # refuses one that is not in air
+        region_points(magnet, Region.sphere(template.dsv_m / 2))
     write_new_study(path, template)
-    return magnet
+    return magnet, template

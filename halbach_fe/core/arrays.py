@@ -90,8 +90,8 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     Raises
     ------
     TypeError, ValueError
-        If they are no real numbers, have a unit of their own, or are labelled by a unit but m or T,
-        by only some of the axes, or by something else.
+        If they are no real numbers, have a unit of their own, or are named or labelled by a unit
+        but m or T, by only some of the axes, or by something else.
     """
     values = _by_labels(_labelled(values), axes)
     if np.iscomplexobj(values):
@@ -136,7 +136,8 @@ def _labelled(values: Any) -> Any:
         return values
     numbers = values.to_numpy()
     labels = [getattr(values, "index", ()), getattr(values, "columns", ())]
-    return xr.DataArray(numbers, dims=("row", "column")[:numbers.ndim], coords={
+    own = getattr(values, "name", None) if numbers.ndim == 1 else None  # no column of a table
+    return xr.DataArray(numbers, dims=("row", "column")[:numbers.ndim], name=own, coords={
         name: [one if isinstance(one, Number) else str(one) for one in found]
         for name, found in zip(("row", "column")[:numbers.ndim], labels, strict=False)
         if len(found)})
@@ -151,10 +152,13 @@ def _by_labels(values: Any, axes: Sequence[str]) -> Any:
     labels = {name: [str(label) for label in values.coords[name].values]
               for name in values.dims if name in values.coords
               and not all(isinstance(label, Number) for label in values.coords[name].values)}
-    if scaled := [text for text in (str(values.attrs.get("units", "")), *chain(*labels.values()))
-                  if OTHER_UNIT.search(text)]:
+    own = str(values.name or "")
+    if scaled := [text for text in (str(values.attrs.get("units", "")), own,
+                                    *chain(*labels.values())) if OTHER_UNIT.search(text)]:
         raise ValueError(f"numbers in other units than m and T: {', '.join(scaled)}; convert them "
                          "and name them anew")
+    if len(axes) == 1 and (other := AXIS.match(own)) and other[1].lower() != axes[0]:
+        raise ValueError(f"{own} in place of {axes[0]}; name it anew")
     for name in [*values.dims][::-1]:
         found = [AXIS.match(label) for label in labels.get(name, [])]
         named = [one[1].lower() for one in found if one]

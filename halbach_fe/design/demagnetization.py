@@ -27,6 +27,7 @@ from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, places_in
+from halbach_fe.response.field_on_lines import reaction_within
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.magnetostatics import (
@@ -111,8 +112,10 @@ class DemagnetizationMap(ShownInNotebook):
     places : Places
         H along the magnetization anywhere in the cells, of which shares and limits follow: the
         middles miss what is past the knee in parts of cells alone, as at faces and edges.
-    kinds : tuple of Demagnetization
-        Data of every material among the blocks.
+    along_error : float, in A/m
+        Error bar of H in the middles that the cells leave in which permeability is solved for: in
+        the block with the strongest opposed field. It is 0 for other routes, beside iron, and of
+        blocks that are not uniform.
     """
 
     magnet: Magnet
@@ -121,6 +124,7 @@ class DemagnetizationMap(ShownInNotebook):
     cells: Cells
     along: Floats
     places: Places
+    along_error: float = 0.0
 
     @property
     def study(self) -> Study:
@@ -337,7 +341,31 @@ def demagnetization_map(
     used = np.append(np.flatnonzero(~opposed), np.arange(len(opposed), len(number)))
     return DemagnetizationMap(magnet, material, blocks, cells, along[:len(opposed)], Places(
         cell, (cells.volumes / np.maximum(1, np.bincount(cell, minlength=len(opposed))))[cell],
-        along[used], outside[used]))
+        along[used], outside[used]), _error_in_worst_block(
+            warm, cells, along[:len(opposed)], easy, session))
+
+
+def _error_in_worst_block(
+    magnet: Magnet, cells: Cells, along: Floats, easy: Floats, session: Session
+) -> float:
+    """Return the error bar in A/m of H ``along`` (cells,) easy axes (blocks, 3) in the middles.
+
+    In one block the deviation of the polarization from its mean has a closed form, which the cells
+    of the method of moments have not, see `halbach_fe.solver.moments.solve.field_within`.
+    """
+    reacting = magnet.with_(solver__method="reaction")
+    if magnet.is_vacuum or magnet.iron or magnet.has_losses or not _by_moments(reacting) or any(
+            len(block.parts) > 1 for block in magnet.blocks):
+        return 0.0
+    number = cells.block[np.argmin(along)]
+    here = cells.block == number
+    points = cells.middles[here]
+    reaction, bar = reaction_within(
+        reacting, points, cells.block[here], solve_separate(reacting, session, estimate=False))
+    strength = _vacuum_field(magnet.blocks, points, None) + reaction + external_field(
+        magnet, points)
+    off = np.abs(strength @ easy[number] / MU_0 - along[here])
+    return float(np.max(off + np.linalg.norm(bar, axis=1) / MU_0))
 
 
 def _anywhere(cells: Cells, numbers: Ints) -> tuple[Ints, Floats]:
@@ -383,14 +411,17 @@ def _reaction_by_moments(
 
 
 def at_temperature(magnet: Magnet) -> Magnet:
-    """Return the magnet whose blocks have the remanence of their materials' temperature."""
+    """Return the magnet whose blocks have the remanence of their materials' temperature, and have
+    lost nothing: the map says where they would, also at other temperatures.
+    """
     factors = {block.place: float(remanence_factor(material, material.temperature_C))
                for block, material in zip(magnet.blocks, magnet.demagnetizations, strict=True)}
-    alike = len(set(factors.values())) == 1
-    return magnet.with_(array__exceptions=(*magnet.array.exceptions, *(
-        BlockException(magnetization_factor=factor, **({} if alike else {
-            "ring": ring, "slot": slot}))
-        for (ring, slot), factor in list(factors.items())[:1 if alike else None])))
+    weaker = [BlockException(ring=ring, slot=slot, magnetization_factor=factor)
+              for (ring, slot), factor in factors.items()]
+    if len(set(factors.values())) == 1:
+        weaker = [weaker[0].with_(ring=None, slot=None)]
+    return magnet.with_(demagnetization__irreversible=False,
+                        array__exceptions=(*magnet.array.exceptions, *weaker))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:

@@ -181,8 +181,10 @@ def obstacle(study: Study) -> tuple[str, str, str, str] | None:
     array = study.array
     if study.dimension == 2:
         return "`dimension`", "3, for a design of rings", "2", ""
-    if study.iron_ring or study.iron or study.external.neighbours:
-        return ("`design`", "of a magnet without iron and neighbours", "one with them",
+    external = study.external
+    if study.iron_ring or study.iron or external.neighbours or external.coils or external.dipoles:
+        return ("`design`", "of a magnet without iron, neighbours, coils and dipoles",
+                "one with some of them",
                 "Leave them out of the search, and look at the result with them.")
     if array.free_blocks is not None or array.exceptions:
         return ("`array`", "of rings without exceptions, for a design",

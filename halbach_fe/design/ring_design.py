@@ -93,7 +93,7 @@ class Designed(ShownInNotebook):
 
 @alone
 def design_rings(
-    study: Study, session: Session = NOT_KEPT, region: Region | None = None, seed: int = 0
+    study: Study, session: Session = NOT_KEPT, region: Region | None = None, seed: int = 1
 ) -> Designed:
     """Choose the rings of a magnet so that its field in a region is homogeneous.
 
@@ -104,7 +104,8 @@ def design_rings(
     session : Session, optional
         Its folder receives what is solved for permeable blocks.
     region : Region, optional
-        By default the sphere about the origin of half the radius of the study's bore.
+        By default that of the study's ``homogeneity``, or else the sphere about the origin of half
+        the radius of its bore.
     seed : int
         Of the random changes of the search.
 

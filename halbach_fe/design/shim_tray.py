@@ -201,6 +201,7 @@ def _with_free_blocks(study: Study, filled: Sequence[Filled]) -> Study:
     shims: dict[str, Sequence[object]] = {
         "name": [f"shim{count + number}" for number in range(1, len(filled) + 1)],
         "shape": ["cuboid"] * len(filled), "slot": slots,
+        "material": [one.magnet.material for one in filled],
         "ring": [len(array.blocks_by_ring) - array.rings + 1] * len(filled),
         **_columns("{}_m", np.array([one.position_m for one in filled])),
         "rotation_z_deg": np.degrees(azimuth).tolist(),

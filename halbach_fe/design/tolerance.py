@@ -184,7 +184,7 @@ def predict_tolerance(
         Limit of every |c_n|, in units of 1e-4.
     """
     mean = model.offset + model.matrix @ prior.mean
-    root = model.matrix @ prior.root
+    root = model.root_of(prior, before=True)
     # a QR decomposition reduces the covariance factor to a square one of the same covariance
     parts = np.vstack([root.real, root.imag])
     (small,) = linalg.qr(parts.T, mode="r")
@@ -212,7 +212,9 @@ def predict_homogeneity(
         Limit of the rms deviation in ppm.
     """
     at_once = 200  # number of magnets whose fields are computed at a time, which limits the memory
-    parts = [model.deviations(model.field(prior.sample(
-        min(at_once, draws - first), generator).T)) for first in range(0, draws, at_once)]
+    parts = [model.deviations(model.drawn(
+        prior, min(at_once, draws - first), generator, before=True))
+        for first in range(0, draws, at_once)]
     mean, rms, whole = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return HomogeneityTolerance(magnet.study, model, model.of(prior), mean, rms, whole, limit)
+    return HomogeneityTolerance(magnet.study, model, model.of(prior, before=True),
+                                mean, rms, whole, limit)

@@ -120,11 +120,13 @@ def read_blocks(path: str | Path) -> BlockTable:
     path = as_path(path)
     where = f"block table {path}"
     attributes, header, rows = csv_table(file_bytes(path, where), where)
-    check_columns(header, (*COLUMNS, *TURN_COLUMNS), where)
+    foreign = ("A table in other columns or units, such as mA m^2, is converted by `halbach-fe "
+               "import-blocks`.")
+    check_columns(header, (*COLUMNS, *TURN_COLUMNS), where, f"Rename or remove it. {foreign}")
     missing = [name for name in REQUIRED_COLUMNS if name not in header]
     if missing:
         raise MeasurementError(must_be("header", where, f"complete with {', '.join(missing)}",
-                                       ",".join(header)))
+                                       ",".join(header), foreign))
     lines = [(number, dict(zip(header, cells, strict=True))) for number, cells in rows]
 
     def numbers(name: str, empty: float | None = None) -> Floats:

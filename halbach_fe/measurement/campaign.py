@@ -258,6 +258,36 @@ def _refuse_copies(name: str, data: xr.Dataset, study: Study) -> None:
             "readings must not count twice", f"{count} of {len(points)} rows that are another row "
             f"again, digit for digit, such as row {row}", "Remove the copies; repeated "
             "measurements differ by their noise."))
+    count, offset = _copies_with_offset(points, blank, noise)
+    if count:
+        _refuse(count, must_be(
+            f"rows of `{name}`", f"study {study.name}", "readings of their own, as the same "
+            "readings must not count twice", f"{count} of {len(points)} rows that are another row "
+            f"again, but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that all "
+            "share", "Remove the copies; repeated measurements differ by their noise, too."))
+
+
+def _copies_with_offset(points: Floats, field: Floats, noise: float) -> tuple[int, Floats]:
+    """Return how many rows of a map are earlier ones at the same place, but for an offset (k,) in T
+    that all share; 0 if chance may have made them.
+
+    After a zero was taken off, values were rounded once more, to a neighbouring step.
+    """
+    most_visits = 8  # of a place, apart from each other, that are compared
+    order = np.lexsort(points.T)  # of equal places the earlier row comes first
+    here, read = points[order], field[order]
+    step = np.array([_steps(column).min(initial=np.inf) for column in field.T])
+    within = np.where(np.isfinite(step), step, 0.0) + SAME_DIGITS_T
+    for apart in range(1, most_visits):
+        same = (here[apart:] == here[:-apart]).all(axis=1)
+        if not same.any():
+            break
+        difference = (read[apart:] - read[:-apart])[same]
+        offset = np.median(difference, axis=0)
+        count = int((np.abs(difference - offset) <= within).all(axis=1).sum())
+        if _no_chance(count, len(difference), field, noise, steps=3):
+            return count, offset
+    return 0, np.zeros(field.shape[1])
 
 
 def _refuse(copies: int, sentence: str) -> None:
@@ -267,23 +297,28 @@ def _refuse(copies: int, sentence: str) -> None:
     warnings.warn(f"{sentence} Until then these count twice.", HalbachWarning, stacklevel=2)
 
 
-def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
+def _no_chance(copies: int, pairs: int, field: Floats, noise: float, steps: int = 1) -> bool:
     """Return whether ``copies`` of ``pairs`` of readings (n, 3) at a place are alike by no chance.
 
     Two readings that are rounded to steps q have the same digits with the probability
-    ``q / (2 sqrt(pi) sigma)``, for q below the noise sigma.
+    ``q / (2 sqrt(pi) sigma)``, for q below the noise sigma, and any of some ``steps`` that are next
+    to each other with so many times that.
     """
     if not copies or noise <= 0:
         return False
     alike = 1.0
     for column in field.T:
-        values = np.unique(column[np.isfinite(column)])
-        steps = np.diff(values)
-        steps = steps[steps > SAME_DIGITS_T]
-        if len(values) and len(steps):
-            ratio = float(steps.min()) / noise
+        found = _steps(column)
+        if len(found):
+            ratio = steps * float(found.min()) / noise
             alike *= 1.0 if ratio > COARSE else ratio / (2 * np.sqrt(np.pi))
     return bool(special.bdtrc(copies - 1, pairs, alike) < BY_CHANCE)
+
+
+def _steps(column: Floats) -> Floats:
+    """Return the differences (m,) between values (n,) that follow each other in size."""
+    steps = np.diff(np.unique(column[np.isfinite(column)]))
+    return steps[steps > SAME_DIGITS_T]
 
 
 def refuse_shared(

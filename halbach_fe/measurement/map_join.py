@@ -556,8 +556,11 @@ def _refused(one: Checked, other: Checked, best: _Match) -> MeasurementError:
     axis = COMPONENTS[int(np.argmin(np.diag(best.pose.turn)))]
     return MeasurementError(must_be(
         f"map '{other.name}'", "the maps that are joined", "one that fits where it overlaps "
-        f"'{one.name}'", "one whose mirror image fits", f"One of the two counts a position axis "
-        f"backwards, {axis} for example: reverse {axis} and B{axis} in the one that is wrong."))
+        f"'{one.name}'", f"one that fits nowhere, but whose mirror image fits to "
+        f"{1e6 * best.rms_T:.3g}\u00a0\u00b5T rms, at a noise of {1e6 * noise:.3g}\u00a0\u00b5T",
+        "Either one of the two counts a position axis backwards, or they are maps of two magnets "
+        f"of one design, which these readings do not tell apart. Of one magnet, reverse {axis}, "
+        f"for example, and B{axis} in the map that is wrong."))
 
 
 def _match_of(

@@ -100,12 +100,14 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> None:
+def check_columns(
+    header: Sequence[str], known: Sequence[str], where: str, hint: str = "Rename or remove it."
+) -> None:
     """Raise MeasurementError if the header has an unknown column."""
     for name in header:
         if name not in known:
             raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
-                                           f"column '{name}'", "Rename or remove it."))
+                                           f"column '{name}'", hint))
 
 
 def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str],

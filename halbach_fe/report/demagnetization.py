@@ -71,6 +71,7 @@ def demagnetization_summary(found: DemagnetizationMap) -> Plain:
         "knee_A_per_m": float(found.margin[worst] - found.along[worst]),
         "least_H_A_per_m": float(found.along[worst]),
         "least_margin_A_per_m": float(found.margin[worst]),
+        "margin_error_A_per_m": found.along_error,
         "at_m": found.cells.middles[worst].tolist(), "block": block.name, "ring": block.ring,
         "slot": block.slot,
         "share_beyond_knee": found.share_beyond_now, "share_error": found.share_error,
@@ -165,8 +166,9 @@ def _margins(found: DemagnetizationMap) -> str:
     worst = int(np.argmin(found.margin))
     block = place_of(found.blocks[found.cells.block[worst]])
     limits = "; ".join(_limit_in_words(found, share) for share in SHARES)
-    return (f"The smallest margin in the middle of a cell is {1e-3 * found.margin[worst]:+.0f} "
-            f"kA/m, in {block}; {limits}.")
+    bar = f"\u00a0±\u00a0{1e-3 * found.along_error:.2g}" if found.along_error else ""
+    return (f"The smallest margin in the middle of a cell is {1e-3 * found.margin[worst]:+.0f}"
+            f"{bar} kA/m, in {block}; {limits}.")
 
 
 def _trust(found: DemagnetizationMap, state: _Losses) -> str:
@@ -184,6 +186,12 @@ def _trust(found: DemagnetizationMap, state: _Losses) -> str:
                      "" if _at_edges_alone(found) else
                      f" ± {_percent(found.share_error)} % is what the share of the volume depends "
                      "on the places in the cells that were computed.")]
+    if found.along_error:
+        sentences.append("The error bar of the margin is what the cells leave in which "
+                         "permeability is solved for (mesh.cells_per_side).")
+    if found.magnet.iron:
+        sentences.append("At edges and inner corners of iron H has no bound either: within the "
+                         "elements of the iron there its values in cells are not known.")
     if is_nonlinear(found.study):
         sentences.append("At other temperatures the field of the iron is scaled with the "
                          "remanence.")

@@ -87,7 +87,7 @@ def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) 
     where = ("of the field integrated along z" if model.integrated
              else "of the cross-section" if model.z is None
              # the middle of a magnet is 0 to rounding
-             else f"at z = {1e3 * round(model.z, 9):.4g} mm (Fourier coefficients of B_r)")
+             else f"at z = {decimals(1e3 * model.z, 4)} mm (Fourier coefficients of B_r)")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in "
             f"{units} (order {model.main}; European convention, order 1 is "
             "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
@@ -164,8 +164,8 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     _, known = best_known(magnets)
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
     local = model.z is not None
-    where = (f"On the circle {circle} at z = {1e3 * model.z:.4g}\u00a0mm" if model.z is not None
-             else "In the middle")
+    where = "In the middle" if model.z is None else (
+        f"On the circle {circle} at z = {decimals(1e3 * model.z, 4)}\u00a0mm")
     name, scale, unit = {
         1: ("dipole harmonic" if local else "dipole field", 1e3, "mT"),
         2: ("gradient, by the quadrupole harmonic," if local else "gradient", 1 / model.radius,
@@ -370,7 +370,7 @@ def place_of(model: MultipoleModel) -> str:
     if model.integrated:
         return f"the field integrated along z, at a radius of {1e3 * model.radius:.4g} mm"
     where = ("" if model.z is None  # the middle of a magnet is 0 to rounding
-             else f" at z = {1e3 * round(model.z, 9):.4g} mm")
+             else f" at z = {decimals(1e3 * model.z, 4)} mm")
     return f"the circle of {1e3 * model.radius:.4g} mm{where}"
 
 

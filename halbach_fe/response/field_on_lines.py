@@ -34,6 +34,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.block_variation import neighbour_deviations
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
@@ -262,7 +263,7 @@ OF_LINES = "--from-m and --to-m"
 
 def field_on_lines(
     magnet: Magnet, lines: Lines, magnetizations: Gaussian, session: Session,
-    inside: bool = False
+    inside: bool = False, before: bool = False
 ) -> FieldOnLines:
     """Return B on lines for normally distributed magnetizations in A/m.
 
@@ -272,6 +273,8 @@ def field_on_lines(
         Of all parameters of the response matrix.
     inside : bool
         Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
+    before : bool
+        Whether this is before a map was read: then the blocks of neighbours deviate, too.
 
     Raises
     ------
@@ -301,6 +304,11 @@ def field_on_lines(
                                 model.whole @ magnetizations.root]).reshape(len(points), 3, -1)
         error = weak = model.error
         polarization = np.zeros((lines.points[..., 0].size, 3, flux.shape[2]))
+    if before:
+        others = np.moveaxis(neighbour_deviations(magnet, points), 0, -1)
+        flux = np.concatenate([flux, others], axis=2)
+        polarization = np.concatenate([
+            polarization, np.zeros((*polarization.shape[:2], others.shape[2]))], axis=2)
     shape = lines.points.shape
     every, bars = (each.reshape(-1, *shape[1:], *each.shape[2:]) for each in (
         flux, error.reshape(-1, 3)))
@@ -545,7 +553,7 @@ def _nominal_strength(
     strength, error = np.zeros_like(points), np.zeros_like(points)
     strength[free] = external_field(magnet, points[free]) + field_of(magnet.blocks, points[free])
     if solved is not None:
-        reaction, error[free] = _reaction(magnet, points[free], number[free], solved)
+        reaction, error[free] = reaction_within(magnet, points[free], number[free], solved)
         strength[free] += reaction
         if solved.iron is not None and in_iron.any():
             strength[in_iron], error[in_iron] = solved.iron.inside(points[in_iron])
@@ -640,7 +648,7 @@ def _induced(body: IronSolid, strength: Floats) -> tuple[Floats, Floats]:
             np.maximum(1 + excess, 1 + excess + slope * square)[:, None])
 
 
-def _reaction(
+def reaction_within(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], solved: SeparateReaction
 ) -> tuple[Floats, Floats]:
     """Return what permeability and iron add to mu_0 H of the nominal magnet, and its error bar.
@@ -663,8 +671,9 @@ def _reaction(
 
     field, error = np.zeros_like(points), np.zeros_like(points)
     free = place < 0 if solved.blocks else np.ones(len(points), bool)
-    field[free], change = solved.field_with_errors(points[free])
-    error[free] = np.linalg.norm(change, axis=1, keepdims=True)
+    if free.any():
+        field[free], change = solved.field_with_errors(points[free])
+        error[free] = np.linalg.norm(change, axis=1, keepdims=True)
     for block in set(place[~free]):
         here = place == block
         strength, bar = field_within(solved.blocks[0], block, present[block], points[here], sources)

@@ -33,6 +33,7 @@ from halbach_fe.geometry.cells import Distance, distance_from_blocks, halved
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import observe
+from halbach_fe.response.block_variation import neighbour_deviations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
@@ -454,6 +455,9 @@ class HomogeneityModel:
     """Of Bx, By and Bz at each point."""
     degrees: int
     """Largest degree of the harmonics."""
+    of_neighbours: Floats
+    """B of what neighbours' blocks deviate by independent modes, of one standard deviation of the
+    prior each, at the region's points. Shape (n, 3, modes), in T."""
 
     @property
     def weights(self) -> Floats:
@@ -472,14 +476,28 @@ class HomogeneityModel:
         mean = float(self.weights @ np.linalg.norm(field, axis=1))
         return PPM * rms(self.response.error) / mean
 
-    def of(self, parameters: Gaussian, seed: int = 0, measured: bool = False) -> Homogeneity:
+    def of(
+        self, parameters: Gaussian, seed: int = 0, measured: bool = False, before: bool = False
+    ) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.
 
-        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`.
+        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`, ``before``
+        as in `drawn`.
         """
-        samples = parameters.sample(DRAWS, np.random.default_rng(seed))
-        every = self.field(np.vstack([parameters.mean, samples]).T)
-        return self.of_fields(every[..., 0], every[..., 1:], measured)
+        mean = self.field(parameters.mean[:, None])[..., 0]
+        return self.of_fields(
+            mean, self.drawn(parameters, DRAWS, np.random.default_rng(seed), before), measured)
+
+    def drawn(
+        self, parameters: Gaussian, count: int, generator: np.random.Generator, before: bool
+    ) -> Floats:
+        """Return B (n, 3, count) in T at the region's points of magnets that are drawn.
+
+        ``before`` a map was read nobody knows what the blocks of neighbours deviate.
+        """
+        found = self.field(parameters.sample(count, generator).T)
+        return found + self.of_neighbours @ generator.standard_normal(
+            (self.of_neighbours.shape[2], count)) if before else found
 
     def field(self, magnetizations: Floats) -> Floats:
         """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d)."""
@@ -879,7 +897,8 @@ def homogeneity_model(
     every = np.vstack([sampling.points, planes[in_air]])
     observation = observe(bare.study, every, np.ones(every.shape, bool))
     return HomogeneityModel(region, every, sampling, in_air,
-                            response_matrix(bare, observation, session), degrees)
+                            response_matrix(bare, observation, session), degrees, np.moveaxis(
+                                neighbour_deviations(magnet, sampling.points), 0, -1))
 
 
 def slice_points(region: Region) -> Floats:

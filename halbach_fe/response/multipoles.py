@@ -39,7 +39,12 @@ from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import Deviations, changes_by_amplitudes
+from halbach_fe.response.block_variation import (
+    Deviations,
+    changes_by_amplitudes,
+    neighbour_deviations,
+    neighbour_modes,
+)
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
@@ -215,6 +220,9 @@ class MultipoleModel:
     """Angle in rad of the axes about z."""
     left_out_T: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Uniform field that the integral along z, which would be infinite, is without."""
+    of_neighbours: Complexes | None = None
+    """Multipoles of what neighbours' blocks deviate by independent modes, of one standard deviation
+    of the prior each. Shape (1 + k, modes), in T (integrated: T m)."""
 
     @property
     def unit(self) -> str:
@@ -230,10 +238,21 @@ class MultipoleModel:
         """Return the matrix (2 k, parameters) from magnetizations to b_n, a_n for a given |C_N|."""
         return UNITS / main * np.vstack([self.matrix[1:].real, self.matrix[1:].imag])
 
-    def of(self, parameters: Gaussian) -> Multipoles:
-        """Return the multipoles of normally distributed magnetizations in A/m."""
+    def of(self, parameters: Gaussian, before: bool = False) -> Multipoles:
+        """Return the multipoles of normally distributed magnetizations in A/m; ``before`` as in
+        `root_of`.
+        """
         return self.known(self.offset + self.matrix @ parameters.mean,
-                          self.matrix @ parameters.root)
+                          self.root_of(parameters, before))
+
+    def root_of(self, parameters: Gaussian, before: bool) -> Complexes:
+        """Return a root (1 + k, q) of the covariance of C.
+
+        ``before`` a map was read nobody knows what the blocks of neighbours deviate.
+        """
+        root = self.matrix @ parameters.root
+        return np.hstack([root, self.of_neighbours]) if (
+            before and self.of_neighbours is not None) else root
 
     def known(self, mean: Complexes, root: Complexes) -> Multipoles:
         """Return the multipoles for a mean (1 + k,) of C and a root (1 + k, q) of its covariance.
@@ -327,10 +346,23 @@ def multipole_models(
         models.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * offset[index], error[index], model.nominal, -turn,
-            magnet.external.background_T if integrated else (0.0, 0.0, 0.0)))
+            magnet.external.background_T if integrated else (0.0, 0.0, 0.0),
+            phases[:, None] * _of_neighbours(magnet, observation, radius, integrated)[index]))
     for each in left_out:
         warnings.warn(each, HalbachWarning, stacklevel=2)
     return models, tuple(left_out)
+
+
+def _of_neighbours(
+    magnet: Magnet, observation: Observation, radius: float, integrated: bool
+) -> Complexes:
+    """Return C_n (K, modes) of `neighbour_modes`, in T, or in T m if integrated along all of z."""
+    if not integrated:
+        return _complexes(observation.apply(neighbour_deviations(magnet, observation.points)).T)
+    highest = observation.operator.shape[0] // 4  # rows of the field near the magnet, and beyond
+    return np.hstack([np.zeros((highest, 0)), *(
+        np.einsum("bk,bm->km", _integrals_of_shapes(blocks, radius, highest)[0],
+                  modes[:, 0] + 1j * modes[:, 1]) for blocks, modes in neighbour_modes(magnet))])
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
@@ -788,14 +820,22 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
             f"{radius:g}",
             "Was it meant in millimetres?" if radius / 1000 <= most_radius * bore < radius / 10
             else "Choose a smaller one." if radius > most_radius * bore else ""))
+    if reference.z_m is not None:
+        free = _free_radius(magnet, reference.z_m, 0.0)
+    if radius > free:
+        raise StudyError(must_be(
+            "--reference-radius-m", f"study {magnet.name}", f"at most {free:.4g} m, where iron "
+            "begins: a circle around iron has no multipoles", f"{radius:g}",
+            "Only a field about a free axis has multipoles; halbach-fe solve computes this one at "
+            "any points."))
     return radius
 
 
-def _free_radius(magnet: Magnet, z: float | None) -> float:
+def _free_radius(magnet: Magnet, z: float | None, beside: float = np.inf) -> float:
     """Return the radius in m about the axis within which there are neither blocks nor iron.
 
     Poles of iron may stand nearer to the axis than the blocks. Beside a circle at ``z`` only those
-    count that are nearer to it along z than the blocks are to the axis.
+    count that are nearer to it along z than the blocks are to the axis, and than ``beside`` in m.
     """
     bore = magnet.bore_radius
     bodies = [body for body in magnet.iron if not body.is_coaxial or body.inner_radius < bore]
@@ -806,7 +846,7 @@ def _free_radius(magnet: Magnet, z: float | None) -> float:
         ends = [(body.surface[2].min(), body.surface[2].max()) for body in bodies]
         heights = np.unique(np.concatenate([np.linspace(*each, 9) for each in ends]))
         if z is not None:
-            heights = np.append(heights[np.abs(heights - z) < bore], z)
+            heights = np.append(heights[np.abs(heights - z) < min(bore, beside)], z)
     angle = 2 * np.pi * np.arange(720) / 720
     circles = np.column_stack([np.tile(np.cos(angle), len(heights)),
                                np.tile(np.sin(angle), len(heights)), np.repeat(heights, 720)])
@@ -814,7 +854,9 @@ def _free_radius(magnet: Magnet, z: float | None) -> float:
     def is_free(radius: float) -> bool:
         return not any(body.contains(circles * [radius, radius, 1.0]).any() for body in bodies)
 
-    radii = np.linspace(0, bore, 65).tolist()
+    spans = [np.hypot(*body.surface[:2]) for body in bodies]
+    middles = [(span.min() + span.max()) / 2 for span in spans]  # of walls thinner than the steps
+    radii = np.unique([*np.linspace(0, bore, 65), *np.minimum(middles, bore)]).tolist()
     for free, beyond in pairwise(radii):
         if not is_free(beyond):
             for _ in range(12):

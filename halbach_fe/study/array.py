@@ -11,6 +11,7 @@ from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.grades import (
+    STRENGTHS,
     Material,
     doubted_strength,
     grade_of,
@@ -287,7 +288,7 @@ class Array(_OfGrade):
         """Fill in what the array's rings or free blocks say in place of the array itself."""
         if not isinstance(given, dict):
             return given
-        values = with_grade(dict(given))
+        values = with_grade(given | {"material": common_material(given)})
         rings, free = values.get("ring") or (), values.get("free_blocks")
         if rings and isinstance(rings, list | tuple):
             rings = values["ring"] = [one for ring in rings for one in _repeated(ring)]
@@ -302,8 +303,7 @@ class Array(_OfGrade):
                 own = [with_grade(ring) if isinstance(ring, dict) else ring for ring in rings]
                 if all(any(_value(ring, key) is not None for key in strengths) for ring in own):
                     values |= {key: _value(own[0], key) for key in strengths}
-        elif free is not None and all(values.get(key) is None or values[key] == 0
-                                      for key in ("rings", "blocks_per_ring", "block")):
+        elif free is not None and _is_empty(values):
             try:
                 table = FreeBlocks.model_validate(free)
             except ValidationError:  # reported by the validation of the key itself
@@ -399,6 +399,48 @@ class Array(_OfGrade):
                     values[other] = None
             values.update(own)
         return type(self).model_validate(values)
+
+
+def _is_empty(array: dict[str, Any]) -> bool:
+    """Return whether an array says nothing of rings, so that it has none beside free blocks."""
+    return all(array.get(key) is None or array[key] == 0
+               for key in ("rings", "blocks_per_ring", "block"))
+
+
+def common_material(array: dict[str, Any]) -> str | None:
+    """Return the grade of an array without one: of its first ring or block, if all name grades."""
+    found = [name for name, _ in _materials(array)]
+    known = found and all(grade_of({"material": name}) for name in found)
+    return found[0] if known and array.get("material") is None else array.get("material")
+
+
+def remanence_sd(array: dict[str, Any]) -> float | None:
+    """Return the largest standard deviation of the remanences that follow from grades, as fractions
+    of these; None if none does.
+    """
+    own = grade_of({"material": common_material(array)})
+    found = [grade_of({"material": name}) or own for name, is_stated in _materials(array)
+             if not is_stated]
+    return max((one.remanence_sd for one in found if one is not None), default=None)
+
+
+def _materials(array: dict[str, Any]) -> list[tuple[str | None, bool]]:
+    """Return the grade that every ring and free block names, and whether its strength is stated."""
+    rings, free = array.get("ring") or (), array.get("free_blocks")
+    stated = any(array.get(key) is not None for key in STRENGTHS)
+    found = [(_value(ring, "material"), any(_value(ring, key) is not None for key in STRENGTHS) or (
+        stated and not _value(ring, "material"))) for ring in rings] if isinstance(
+            rings, list | tuple) else []
+    if not found and not (free is not None and _is_empty(array)):  # equal rings
+        found = [(array.get("material"), stated)]
+    columns = {key: _value(free, key) or () for key in ("name", "material", *STRENGTHS)}
+    if not all(isinstance(values, list | tuple) for values in columns.values()):
+        return found  # reported by the validation of the key itself
+    for number in range(len(columns["name"])):
+        of_block = {key: values[number] for key, values in columns.items() if number < len(values)}
+        found.append((of_block.get("material"), any(
+            of_block.get(key) is not None for key in STRENGTHS)))
+    return found
 
 
 def block_name(ring: int, slot: int) -> str:

@@ -19,9 +19,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
-from halbach_fe.study.array import Array
+from halbach_fe.study.array import Array, common_material, remanence_sd
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
-from halbach_fe.study.grades import STRENGTHS, grade, grade_of
+from halbach_fe.study.grades import grade, grade_of
 from halbach_fe.study.inference import (
     POSE_KEYS,
     PROBE_KEYS,
@@ -162,13 +162,13 @@ class Study(StudyModel, metaclass=_OfKeys):
         """Fill in what the grade of the array's material says about prior and demagnetization."""
         if not isinstance(given, dict) or not isinstance(array := given.get("array"), dict):
             return given  # a validated array has been through here
-        found = grade_of(array)
+        found = grade_of({"material": common_material(array)})
         if found is None:
             return given
         values = dict(given)
         prior = values.get("prior", {})
-        if isinstance(prior, dict) and all(array.get(key) is None for key in STRENGTHS):
-            values["prior"] = {"common_mode_sd": found.remanence_sd} | prior
+        if isinstance(prior, dict) and (sd := remanence_sd(array)) is not None:
+            values["prior"] = {"common_mode_sd": sd} | prior
         demagnetization = values.get("demagnetization")
         if isinstance(demagnetization, dict):
             values["demagnetization"] = found.demagnetization_defaults | demagnetization

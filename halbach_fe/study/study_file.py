@@ -313,9 +313,9 @@ class MagnetTemplate:
     ``material`` names a grade of magnet in place of the remanence. ``inner_radii_m`` are the inner
     radii of rings of their own, in the order of z. ``free_blocks`` is the path of a table of blocks
     that takes the place of the rings, from the folder of the study file. ``cube_m`` is the
-    edge of cubes, ``steel`` the name of the steel of the iron ring, ``dsv_m`` the diameter of a
-    sphere that is measured in place of circles along the magnet. ``sigma_T`` and ``position_sd_m``
-    are the noise of readings and positions.
+    edge of cubes, ``radius_m`` the radius of their middles, ``steel`` the name of the steel of the
+    iron ring, ``dsv_m`` the diameter of a sphere that is measured in place of circles along the
+    magnet. ``sigma_T`` and ``position_sd_m`` are the noise of readings and positions.
     """
 
     multipole_order: int = 1
@@ -331,6 +331,7 @@ class MagnetTemplate:
     inner_radii_m: tuple[float, ...] = ()
     free_blocks: str | None = None
     cube_m: float | None = None
+    radius_m: float | None = None
     steel: str | None = None
     dsv_m: float | None = None
     sigma_T: float = 5e-5

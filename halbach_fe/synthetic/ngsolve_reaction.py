@@ -51,6 +51,9 @@ second in three. The boundary therefore changes the reaction by (1/100)^2 or (1/
 field, and Halbach arrays have a very small dipole moment.
 """
 
+USUAL_ORDER = {2: 5, 3: 3}
+"""Polynomial order of the potential by dimension."""
+
 END_SIZE = 1 / 8
 """Smallest size of elements at the ends of tubes and plates of iron, relative to that elsewhere;
 above it they are as large as the iron is thick. The field is singular at these edges. Around a
@@ -67,7 +70,7 @@ class Elements:
     dimensions, a sixth in two; less at the ends of iron tubes, see `END_SIZE`, and half as much in
     other iron: beside plates of 8 mm the error fell from 1.2e-4 T to 2.2e-5 T rms. In m."""
     order: int | None = None
-    """Polynomial order of the potential; by default 3 in three dimensions and 5 in two."""
+    """Polynomial order of the potential, by default `USUAL_ORDER`."""
     grading: float = 0.3
     """Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast)."""
     mirrored: tuple[int, int, int] = (0, 0, 0)
@@ -85,7 +88,7 @@ def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None
     elements, size = elements or Elements(), magnet.dimension
     with import_extra("ngsolve").TaskManager():
         mesh = mesh_of(magnet, points, elements)
-        potential = solve_potential(magnet, mesh, elements.order or {2: 5, 3: 3}[size])
+        potential = solve_potential(magnet, mesh, elements.order or USUAL_ORDER[size])
         mirrored = np.flatnonzero(elements.mirrored)
         near = points[:, :size].copy()
         near[:, mirrored] = np.abs(near[:, mirrored])

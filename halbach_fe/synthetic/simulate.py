@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -20,8 +21,8 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.arrays import Floats, spread
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress
@@ -50,7 +51,7 @@ from halbach_fe.synthetic.hidden_effects import (
 )
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
-from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
+from halbach_fe.synthetic.ngsolve_reaction import USUAL_ORDER, Elements, moment_field
 from halbach_fe.synthetic.reaction import (
     by_elements,
     lone_moment_matrix,
@@ -186,6 +187,8 @@ def simulate_campaign(
     recorded, readings = measured(
         magnet, instrument, points, others, elements, faults, progress, offsets, study.instrument,
         magnitude)
+    if elements not in (None, Elements()) and not magnet.is_vacuum and by_elements(magnet):
+        _warn_of_elements(magnet, points, elements, float(np.nanmin(sigma)))
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "effects": [effect.plain() for effect in hidden],
@@ -207,6 +210,27 @@ def simulate_campaign(
             for part in (slice(len(points)), slice(len(points), None))]
     return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact,
                              magnet)
+
+
+def _warn_of_elements(
+    magnet: TrueMagnet, points: Floats, elements: Elements, noise: float
+) -> None:
+    """Warn if elements of a further order change the field at some points by more than the noise in
+    T.
+    """
+    compared = 500  # largest number of points
+    points = spread(points, compared)
+    order = elements.order or USUAL_ORDER[magnet.dimension]
+    own, finer = (reaction_field(magnet, points, replace(elements, order=each))
+                  for each in (order, order + 1))
+    change = np.abs(finer - own)
+    if change.max() > noise:
+        rms, most, noise_uT = 1e6 * np.sqrt(np.mean(change**2)), 1e6 * change.max(), 1e6 * noise
+        warnings.warn(
+            f"The simulated field is rougher than its noise of {noise_uT:.3g} µT: elements of "
+            f"order {order + 1} change it by {rms:.3g} µT rms, and by {most:.3g} µT at most, the "
+            "same for every reading of a place. Leave --order and --element-size out, take smaller "
+            "elements, or state more noise.", HalbachWarning, stacklevel=3)
 
 
 def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:

@@ -110,6 +110,14 @@ def test_every_class_documents_its_attributes(name):
     assert "Attributes" in sections(vars(getattr(hf, name))["__doc__"])
 
 
+def test_seeds_are_those_of_the_commands():
+    """A function without a seed returns what its command does: the rings of a design differed."""
+    seeds = {name: inspect.signature(getattr(hf, name)).parameters["seed"].default
+             for name in FUNCTIONS if "seed" in inspect.signature(getattr(hf, name)).parameters}
+    assert len(seeds) > 3
+    assert set(seeds.values()) == {1}  # the default of --seed
+
+
 def test_missing_sections_and_parameters_are_seen():
     lacking = """Solve.
 

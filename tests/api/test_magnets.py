@@ -582,6 +582,22 @@ def test_labels_that_state_another_unit(label):
         hf.field_map(points, pandas.DataFrame(points, columns=["x", "y", label]))
 
 
+def test_names_of_series_and_arrays():
+    """They were not read: mT were T, and By was Bx. Control: names that fit, and none."""
+    points, column = np.zeros((1, 3)), np.array([3.0])
+    for name in ("By_T", "By [T]", "B", None):
+        data = hf.field_map(points, pandas.Series(column, name=name), components=["y"])
+        assert data["B_T"].values[0, 1] == 3.0
+    for values, components, said in (
+            (pandas.Series(column, name="By [mT]"), ["y"], "in other units than m and T"),
+            (pandas.Series(column, name="By_T"), ["x"], "By_T in place of x"),
+            (xr.DataArray(points, name="B_mT"), ["x", "y", "z"], "in other units than m and T")):
+        with pytest.raises(hf.HalbachError, match=said):
+            hf.field_map(points, values, components=components)
+    with pytest.raises(hf.HalbachError, match="in other units than m and T: sigma_mT"):
+        hf.field_map(points, points, pandas.Series([0.1], name="sigma_mT"))
+
+
 def test_columns_in_a_dict(generator):
     """So have structured arrays and Datasets them. Control: a dict without one of them."""
     ring = hf.halbach_ring(**RING)

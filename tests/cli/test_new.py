@@ -10,6 +10,7 @@ import shlex
 import numpy as np
 import pytest
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
@@ -28,7 +29,7 @@ MAGNETS = [
                ("sector", "trapezoid", "cuboid"), (False, True), (None, 0.03), (1, 2))]
 MAGNETS += [MagnetTemplate(material="N42"),
             MagnetTemplate(shape="cuboid", cube_m=0.012, ring_length_m=0.012, inner_radius_m=0.13,
-                           outer_radius_m=0.142, blocks_per_ring=24, dsv_m=0.16),
+                           outer_radius_m=0.142, blocks_per_ring=24, dsv_m=0.16, iron_ring=True),
             MagnetTemplate(steel="aisi_1010", iron_ring=True),
             MagnetTemplate(inner_radii_m=(0.05, 0.06), ring_length_m=0.03, shape="trapezoid"),
             MagnetTemplate(free_blocks=str(ROOT / "studies/mri4all/blocks.csv")),
@@ -145,6 +146,33 @@ def study_without_sphere(folder):
     path = folder / "circles.toml"
     assert main(["new", str(path), *CUBES, "--rings", "4"]) == 0
     return path
+
+
+@pytest.mark.parametrize(("values", "said"), [
+    ({"cube_m": 0.012}, "radius_m"),
+    ({"cube_m": 0.012, "radius_m": 0.05, "shape": "sector"}, "shape"),
+    ({"dsv_m": 0.04}, "ring_length_m"), ({"rings": 3}, "ring_length_m"),
+    ({"material": "N42", "remanence_T": 1.0}, "remanence_T"), ({"sigma_T": 1e-3}, "sigma_T"),
+    ({"inner_radii_m": (0.02, 0.03), "ring_length_m": 0.03, "rings": 5}, "rings"),
+    ({"ring_length_m": 0.04, "dsv_m": 0.12}, "the region")])
+def test_values_without_effect_are_refused_in_python_too(tmp_path, values, said):
+    """Cubes were sectors of a cross-section there, and a grade took the place of a remanence."""
+    with pytest.raises(StudyError, match=f"^Input {said} of"):
+        hf.new(tmp_path / "new.toml", **values)
+    assert not (tmp_path / "new.toml").exists()
+
+
+@pytest.mark.parametrize(("options", "values"), [
+    (["--cube-m", "0.012", "--radius-m", "0.05", "--rings", "2", "--iron-ring"],
+     {"cube_m": 0.012, "radius_m": 0.05, "rings": 2, "iron_ring": True}),
+    (["--steel", "aisi_1010"], {"steel": "aisi_1010"}),
+    (["--inner-radii-m", "0.06,0.1", "--ring-length-m", "0.03"],
+     {"inner_radii_m": (0.06, 0.1), "ring_length_m": 0.03})])
+def test_python_makes_the_study_of_the_command(tmp_path, options, values):
+    path = tmp_path / "cli" / "magnet.toml"
+    path.parent.mkdir()
+    assert main(["new", str(path), *options]) == 0
+    assert hf.new(tmp_path / "magnet.toml", **values).study == read_study(path)
 
 
 @pytest.mark.parametrize(("options", "code", "said"), [

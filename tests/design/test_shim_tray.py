@@ -171,6 +171,10 @@ def test_what_the_study_says_of_its_blocks_is_not_of_the_shims(measured, tmp_pat
                                  for blocks in (changed, plain)), atol=1.0)  # of 1e6 A/m
     np.testing.assert_allclose([each.middle for each in changed[-count:]],
                                [one.position_m for one in found.filled])
+    of_grade = build_magnet(replace(found, filled=tuple(
+        replace(one, magnet=one.magnet.with_(remanence_T=None, material="N42"))
+        for one in found.filled)).filled_study)
+    assert of_grade.materials == (None,) * (len(of_grade.blocks) - count) + ("N42",) * count
 
 
 def test_shims_next_to_the_region(tmp_path):

@@ -12,7 +12,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.study.reader import parse_study
 
 SIGMA = 1e-5
@@ -106,6 +106,29 @@ def test_a_copy_with_another_zero(generator):
                            "an offset of 5\u00a0\u00b5T"):
             maps_of(study("one", "two"), {
                 "one": field_map(GRID, first), "two": field_map(places, copy)})
+
+
+@pytest.mark.parametrize("digits", [9, 7])
+def test_a_copy_with_another_zero_within_one_file(generator, digits):
+    """After a zero was taken off, values are as they are, or rounded once more. Controls: maps that
+    were read again, with the same offset; also if the noise is a tenth of what is stated, and by a
+    device of so few digits that all readings of a uniform field repeat, one step higher.
+    """
+    first, offset = read(generator, digits), np.array([5.3e-6, -3.1e-6, 0.0])
+    for second in (first + offset, np.round(first + offset, digits)):
+        with pytest.raises(MeasurementError, match=r"640 of 1280 rows that are another row again, "
+                           r"but for an offset of 5\.\d?\u00a0\u00b5T"):
+            maps_of(study(), twice(first, second))
+    both = twice(first, read(generator))  # of which both are copied
+    points, values = points_of(both), both["B_T"].values
+    with pytest.raises(MeasurementError, match=r"1280 of 2560 rows .* offset"):
+        maps_of(study(), field_map(
+            np.vstack([points, points]), np.vstack([values, values + offset])))
+    for noise in (SIGMA, SIGMA / 10):
+        maps_of(study(), twice(*(read(generator, digits, noise) + zero for zero in (0, offset))))
+    uniform = np.broadcast_to([0.1, 0.0, 0.02], GRID.shape)
+    few = read(generator, 4, SIGMA / 10, uniform)
+    maps_of(study(), twice(few, few + 1e-4))
 
 
 def test_a_field_along_z_in_two_dimensions_is_told(generator):

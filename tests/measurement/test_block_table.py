@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.measurement.block_table import COLUMNS, BlockTable, read_blocks, write_blocks
 
@@ -136,3 +137,19 @@ def test_nothing_half_written(tmp_path):
 def test_arrays_of_another_shape(changes):
     with pytest.raises(MeasurementError, match=f"{next(iter(changes))} .* of the shape"):
         table(**changes)
+
+
+def test_a_table_in_other_units_is_sent_to_import_blocks(tmp_path):
+    """The command reads what the refusal sends to it, and the moments are right."""
+    header = HEADER.replace("_A_m2", "_mA_m2")
+    path = written(tmp_path, *ROWS, header=header)
+    with pytest.raises(MeasurementError, match="`halbach-fe import-blocks`"):
+        read_blocks(path)
+    with pytest.raises(MeasurementError, match=r"complete with sigma_A_m2.*`halbach-fe import-b"):
+        read_blocks(written(tmp_path, "A1,5,1,2,3", header="serial,type,mx_A_m2,my_A_m2,mz_A_m2"))
+    path = written(tmp_path, *ROWS, header=header)
+    assert main(["import-blocks", str(path), "-o", str(tmp_path / "own.csv")]) == 0
+    own = read_blocks(tmp_path / "own.csv")
+    same = read_blocks(written(tmp_path, *ROWS))
+    np.testing.assert_allclose(own.moment, 1e-3 * same.moment)
+    np.testing.assert_allclose(own.sigma, 1e-3 * same.sigma)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import magpylib
 import numpy as np
@@ -172,6 +173,22 @@ def test_maps_that_cannot_be_joined(generator):
     foreign = read(MAGNETS[0](np.random.default_rng(5)), poses[1], generator)
     with pytest.raises(MeasurementError, match="another magnet"):
         joined_of(maps | {"part1": foreign})
+
+
+def test_a_mirror_image_that_fits_may_be_of_another_magnet():
+    """Of two quadrupoles of one design the mirror image may fit nearly, which is no mirrored axis.
+    Control: a map of another magnet of which nothing fits is told without a mirror image that does.
+    """
+    one, other = (SimpleNamespace(name=name, floor_T=3e-6) for name in ("one", "other"))
+    pose = Pose(np.diag([1.0, 1.0, -1.0]), np.zeros(3))
+    found = map_join._Match(pose, 1, off=1.4, rms_T=6e-6, odds=100.0)
+    assert found.fits
+    said = str(map_join._refused(one, other, found))
+    assert "mirror image fits to 6\u00a0µT rms, at a noise of 4.24\u00a0µT" in said
+    assert "or they are maps of two magnets of one design" in said
+    assert "reverse z" in said
+    said = str(map_join._refused(one, other, replace(found, off=100.0)))
+    assert "whose mirror image fits" not in said
 
 
 def test_a_copy_of_a_map_is_refused(generator):

@@ -128,6 +128,11 @@ def test_the_field_in_the_middle_is_said_first(given):
         value = float(re.search("is ([0-9.]+)", said)[1])
         assert value == pytest.approx(size / scale, rel=ALIASES)
     assert "On the circle" not in solution.answer(found).said
+    rounded = given.study.observation.positions.model_copy(update={
+        "z_min_m": -0.055, "z_max_m": 0.055, "count": 21})  # the 11th at -7e-18 m
+    found = hf.solve(build_magnet(given.study.with_(
+        observation__positions=rounded.model_dump())), given.session)
+    assert "at z = 0\u00a0mm" in solution.page(found).answer.said
 
 
 def test_blocks_that_are_not_as_designed_are_named(given):

@@ -7,6 +7,7 @@ import tomllib
 import magpylib
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.core.errors import StudyError
@@ -14,9 +15,11 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response.block_variation import Variations, neighbour_deviations
+from halbach_fe.response.homogeneity import DRAWS
 from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
+from tests.support import short_dipole
 
 TEXT = """
 name = "four"
@@ -149,3 +152,71 @@ def test_neighbours_deviate_as_their_field_does(permeability):
     sd = np.linalg.norm(neighbour_deviations(magnet, points), axis=0)
     np.testing.assert_allclose(sd, 0.01 * np.abs(external_field(magnet, points)), rtol=1e-6,
                                atol=1e-10)  # of the blocks by themselves: 2e-11
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 40.0])
+def test_bars_before_a_map_have_the_blocks_of_neighbours(turn_deg):
+    """Strengths and directions of the blocks of both magnets vary alone, and all strengths of a
+    magnet together, by standard deviations whose fields magpylib computes. Control: the bars of the
+    magnet's own blocks alone are others.
+    """
+    place_m, radius_m, at_m = 0.08, 0.005, 0.04  # between both magnets
+    magnet = build_magnet(parse_study(tomllib.loads(short_dipole.TEXT) | {
+        "external": {"neighbours": [{"z_m": place_m, "turn_deg": turn_deg}]}}))
+    prior, session = magnet.study.prior, Session.temporary()
+    nominal = np.array([block.polarization for block in magnet.blocks])
+    sources = short_dipole.truth(np.random.default_rng(0)).sources
+
+    def modes(points, turn):
+        """Fields (modes, n, 3) of one standard deviation each of a magnet's blocks."""
+        matrix = Rotation.from_euler("z", turn, degrees=True).as_matrix()
+
+        units = np.array([[source.copy(polarization=source.orientation.inv().apply(one)).getB(
+            points @ matrix) for one in np.eye(3)] for source in sources]) @ matrix.T
+        strong = prior.magnitude_sd * nominal
+        tilted = np.radians(prior.direction_sd_deg) * np.array([
+            [np.cross(along, [0, 0, 1.0]), [0, 0, np.linalg.norm(along)]] for along in nominal])
+        changes = np.concatenate([strong[:, None], tilted], axis=1)
+        alone = np.einsum("bij,bjnk->bink", changes, units)
+        together = np.einsum("bj,bjnk->nk", prior.common_mode_sd * nominal, units)
+        return np.concatenate([alone.reshape(-1, *together.shape), together[None]])
+
+    def bars(points, of):
+        """Standard deviations of values of fields (modes, n, 3): of both magnets, and of one."""
+        own, other = (np.sum(of(modes(points - [0, 0, z], turn))**2, axis=0)
+                      for z, turn in ((0.0, 0.0), (place_m, turn_deg)))
+        return np.sqrt(own + other), np.sqrt(own)
+
+    line = np.column_stack([np.zeros((3, 2)), np.linspace(0.035, 0.045, 3)])
+    both, alone = bars(line, lambda fields: fields)
+    found = hf.field(magnet, hf.Lines(line[0], line[-1], count=3), session)
+    np.testing.assert_allclose(found.sd[0], both, rtol=1e-6)
+    assert (alone < 0.9 * both).any()
+
+    angle = 2 * np.pi * np.arange(16) / 16
+    radial = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    reference = hf.MultipoleReference(radius_m, (2, 3), at_m)
+    tables = hf.multipoles(magnet, session, reference).tables
+    heights = np.arange(-0.6, 0.6 + place_m, 0.004)  # beyond, the field of a mode is below 1e-5
+    for (model, known), z in zip(tables, (heights, np.array([at_m])), strict=True):
+        points = (radius_m * radial + np.array([0, 0, 1.0]) * z[:, None, None]).reshape(-1, 3)
+        wave = np.exp(-1j * (angle - model.turn))  # -turn is that of the nominal field
+
+        def main(fields, z=z, wave=wave):
+            shown = np.einsum("mzai,ai,a->mz", fields.reshape(-1, len(z), 16, 3), radial, wave)
+            return np.abs((shown / 8).sum(axis=1).imag) * (0.004 if len(z) > 1 else 1)
+
+        both, alone = bars(points, main)
+        assert known["prior"].main_sd == pytest.approx(both, rel=1e-3)
+        assert alone < 0.9 * both
+
+    region = hf.Region.sphere(0.004, (0.0, 0.0, at_m))
+    # the mean over a sphere is the field in its middle
+    both, alone = bars(np.array(2 * [[0, 0, at_m]]), lambda fields: fields[:, 0])
+    share = 4 / np.sqrt(2 * DRAWS)  # of a standard deviation of so many draws: 4 sigma
+    found = hf.homogeneity(magnet, session, region).by_name["prior"]
+    along = found.direction**2
+    assert found.mean_sd_T == pytest.approx(np.sqrt(along @ both**2), rel=share)
+    assert np.sqrt(along @ alone**2) < (1 - share) * found.mean_sd_T
+    drawn = hf.tolerance(magnet, session, draws=DRAWS, reference=reference).main
+    assert drawn.std() == pytest.approx(tables[1][1]["prior"].main_sd, rel=share)

@@ -27,6 +27,7 @@ from halbach_fe.response.multipoles import (
     multipole_model,
     multipole_models,
     solved_circles,
+    unwanted_orders,
 )
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT, Session
@@ -626,6 +627,22 @@ def test_circles_that_all_but_touch_poles_are_refused(session):
     magnet = build_magnet(parse_study(POLES))
     with pytest.raises(StudyError, match=r"to 0\.01425 m, as the poles' inner radius is 0\.015 m"):
         multipole_model(magnet, MultipoleReference(0.0145), session)
+
+
+@pytest.mark.parametrize(("length_m", "z_m"), [(None, None), (0.1, None), (0.1, 0.0)])
+@pytest.mark.parametrize("wall_m", [0.0003, 0.01])
+def test_circles_around_iron_are_refused(session, length_m, z_m, wall_m):
+    """They are all in air, but iron within them has a field of its own. Walls thinner than the
+    steps in which iron is looked for were not seen. Controls: a circle within, and one beside it.
+    """
+    tube = {"kind": "tube", "inner_radius_m": 0.0201, "outer_radius_m": 0.0201 + wall_m}
+    magnet = halbach_ring(blocks=8, inner_radius_m=0.05, outer_radius_m=0.07, length_m=length_m
+                          ).with_(iron={"relative_permeability": 100.0, "bodies": [tube]})
+    with pytest.raises(StudyError, match=r"at most 0\.0201 m, where iron begins.* received 0\.035"):
+        multipole_model(magnet, MultipoleReference(0.035, z_m=z_m), session)
+    assert unwanted_orders(magnet, MultipoleReference(0.018, z_m=z_m))[1] == 0.018
+    if z_m is not None:
+        assert unwanted_orders(magnet, MultipoleReference(0.035, z_m=0.06))[1] == 0.035
 
 
 @pytest.mark.parametrize(("external", "key", "sd"), [

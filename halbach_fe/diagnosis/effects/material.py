@@ -211,7 +211,8 @@ class KneeEffect(Effect):
         places = self.places(study)
         if not places:
             return []
-        losses = _mean_losses(study, places) / MU_0
+        losses = _mean_losses(study, [
+            self.apply(study, place, [1.0]).demagnetization for place in places]) / MU_0
         gains = losses @ score
         sizes = np.einsum("pi,ij,pj->p", losses, information, losses)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -260,9 +261,9 @@ class KneeEffect(Effect):
         return values, sd
 
 
-def _mean_losses(study: Study, places: Sequence[Place]) -> Floats:
-    """Return the change of the mean polarization of every block (places, 3 blocks) in T, if each is
-    in the field of the intact blocks in vacuum.
+def _mean_losses(study: Study, materials: Sequence[Demagnetization | None]) -> Floats:
+    """Return the change of the mean polarization of every block (materials, 3 blocks) in T, if each
+    is in the field of the intact blocks in vacuum.
     """
     blocks = build_magnet(study).blocks
     # Gauss nodes per direction and block at which the field is computed for the cheap estimate
@@ -274,13 +275,14 @@ def _mean_losses(study: Study, places: Sequence[Place]) -> Floats:
     field = field_of(blocks, cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
     along = np.einsum("nqi,ni->nq", field, easy[cells.block])
     volume = np.bincount(cells.block, cells.volume, len(blocks))
-    found = np.empty((len(places), len(blocks), 3))
-    for number, place in enumerate(places):
-        lost = 1 - KneeLaw(MU_0 * place.at_m[0], SQUARENESS).kept(along)
+    found = np.empty((len(materials), len(blocks), 3))
+    for number, material in enumerate(materials):
+        assert material is not None  # the effect has put it into the study
+        lost = 1 - KneeLaw.of(material).kept(along)
         share = np.bincount(cells.block, cells.volume * np.einsum(
             "nq,nq->n", cells.weights, lost), len(blocks)) / volume
         found[number] = -(strength * share)[:, None] * easy
-    return found.reshape(len(places), -1)
+    return found.reshape(len(materials), -1)
 
 
 def _coercivity(place: Place, relative: float) -> float:

@@ -56,10 +56,16 @@ class KneeLaw:
 
     @classmethod
     def of(cls, material: Demagnetization) -> KneeLaw:
-        """Return the law of a study's material at its temperature."""
-        change = material.coercivity_coefficient_per_K * (
-            material.temperature_C - material.reference_temperature_C)
-        return cls(MU_0 * material.intrinsic_coercivity_A_per_m * (1 + change),
+        """Return the law of a study's material that has been at its temperature.
+
+        There the blocks are weaker, and so is the field that they are in. The part that is left at
+        ``B_r`` with the coercivity ``h_c / (1 + a)`` is that at ``(1 + a) B_r`` with ``h_c``: all
+        fields are as much weaker as the remanence, but for those of other sources.
+        """
+        hotter = material.temperature_C - material.reference_temperature_C
+        coercivity, remanence = (1 + hotter * each for each in (
+            material.coercivity_coefficient_per_K, material.remanence_coefficient_per_K))
+        return cls(MU_0 * material.intrinsic_coercivity_A_per_m * coercivity / remanence,
                    material.squareness)
 
     def _at(self, field: Floats) -> tuple[Floats, Floats]:
