@@ -179,10 +179,10 @@ def infer(
             "readings were discarded, which may change a posterior variance by a fraction of up to "
             f"{last.update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
-    if magnet.is_nonlinear and not linearized_only:
-        _check_linearization(magnet, last.readings.observation, session, last.model,
-                             last.whole.mean[:len(last.model.parameters)], last.errors.sd)
-    return search.result(blocks, at_rest)
+    bent_iron = "" if linearized_only or not magnet.is_nonlinear else _check_linearization(
+        magnet, last.readings.observation, session, last.model,
+        last.whole.mean[:len(last.model.parameters)], last.errors.sd)
+    return replace(search.result(blocks, at_rest), bent_iron=bent_iron)
 
 
 @dataclass(frozen=True)
@@ -667,8 +667,10 @@ def observation_of(
 def _check_linearization(
     magnet: Magnet, observation: Observation, session: Session, model: Response, mean: Floats,
     sigma: Floats,
-) -> None:
-    """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
+) -> str:
+    """Warn if the linearization of the iron changes readings of the posterior mean noticeably, and
+    return that sentence; it is empty if not.
+    """
     # Error that the linearization of the iron may cause in a reading, relative to its error bar; a
     # larger error causes a warning.
     linear_enough = 0.3
@@ -683,8 +685,10 @@ def _check_linearization(
     others = np.zeros(len(model.parameters) - len(mean))
     linear = model.offset + model.matrix @ np.append(mean, others)
     worst = float((np.abs(linear - true) / sigma).max())
-    if worst > linear_enough:
-        warnings.warn(
-            "The iron is linearized about the nominal magnet, which changes a reading of the "
+    if worst <= linear_enough:
+        return ""
+    said = ("The iron is linearized about the nominal magnet, which changes a reading of the "
             f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the "
-            "non-linear posterior.", HalbachWarning, stacklevel=2)
+            "non-linear posterior.")
+    warnings.warn(said, HalbachWarning, stacklevel=3)
+    return said

@@ -381,5 +381,5 @@ def with_samples(update: InferenceResult, sampled: SampledPosterior) -> Inferenc
     values, vectors = np.linalg.eigh(root @ root.T)
     from_samples = replace(update.posterior, mean=sampled.mean,
                            root=vectors * np.sqrt(np.maximum(values, 0)))
-    return replace(update, kind="samples", posterior=from_samples,
+    return replace(update, kind="samples", posterior=from_samples, bent_iron="",
                    prediction_posterior=sampled.prediction, prediction_field=None)

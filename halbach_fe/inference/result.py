@@ -396,6 +396,8 @@ class InferenceResult(ShownInNotebook):
     noise_blocks : tuple of MagnetBlock or None
         Blocks in whose gradient uncertain positions make the noise, as a first update estimated
         them; None if they are the nominal ones.
+    bent_iron : str
+        A sentence if iron is not as linear as the update takes it to be.
     stray_field : StrayField or None
         How far outside the field of the updated magnet is strong; None if that was not computed,
         see `halbach_fe.response.stray_field.stray_field`.
@@ -440,6 +442,7 @@ class InferenceResult(ShownInNotebook):
     regions_left_out: tuple[LeftOut, ...] = ()
     prediction_field: Prediction | None = None
     noise_blocks: tuple[MagnetBlock, ...] | None = None
+    bent_iron: str = ""
     stray_field: StrayField | None = None
     magnetic_axis: MagneticAxis | None = None
 
@@ -665,7 +668,7 @@ class InferenceResult(ShownInNotebook):
             return Reservation(f"Only in part. {wide[0].in_words}: where no map lies, the magnet "
                                "is known no better than its error bars say.")
         said = shared_in_words(self.shared_doubts, self.magnet.dimension == 2) or " ".join(
-            self.table_doubts) or far_in_words(self.far_amplitudes)
+            self.table_doubts) or self.bent_iron or far_in_words(self.far_amplitudes)
         return Reservation(f"Only with care. {said}" if said else "")
 
     @property

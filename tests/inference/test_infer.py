@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+from dataclasses import replace
 
 import magpylib
 import numpy as np
@@ -513,10 +514,15 @@ def test_saturated_iron_is_linearized(dipole, generator, session):
     assert update.prior_conflict < update.conflict_limit
     shift = np.abs(update.response.offset) / update.sigma
     assert shift.max() > 10
+    assert not update.bent_iron
+    # where it is not good enough, whatever is computed from the posterior says so
+    assert not update.reservation
+    assert replace(update, bent_iron="It is bent.").reservation == "Only with care. It is bent."
 
 
 def test_iron_that_is_too_far_from_linear_is_said(dipole, generator, session):
     # of 5 % changes the iron's curve makes hundreds of times the noise on any mesh
     study, data, _ = saturated_campaign(dipole, generator, session, 0.05, sizes=(0.02, 0.015))
     with pytest.warns(HalbachWarning, match="needs the non-linear posterior"):
-        infer(build_magnet(study), data, session)
+        found = infer(build_magnet(study), data, session)
+    assert "needs the non-linear posterior" in found.bent_iron
