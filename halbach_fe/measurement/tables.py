@@ -164,7 +164,7 @@ def finite(cell: str, what: str, where: str, hint: str = "") -> float:
                                        hint)) from None
 
 
-TIME_OF_DAY = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:[.,]\d{1,9})?))?")
+TIME_OF_DAY = re.compile(r"([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,9})?)")
 
 
 def look_like_clock(values: Floats) -> bool:
@@ -196,12 +196,12 @@ def times_from_clock(values: Floats) -> Floats | None:
 def times_from_texts(cells: Sequence[str]) -> Floats | None:
     """Return times (n,) in s after the first one of times of day or ISO stamps.
 
-    None stands for cells that are neither.
+    None stands for cells that are neither. 14:23 may be hours and minutes, or minutes and seconds.
     """
     found = [TIME_OF_DAY.fullmatch(cell.strip()) for cell in cells]
     if all(found):
         return _over_midnight(np.array([
-            int(part[1]) * 3600 + int(part[2]) * 60 + float((part[3] or "0").replace(",", "."))
+            int(part[1]) * 3600 + int(part[2]) * 60 + float(part[3].replace(",", "."))
             for part in found if part]))
     try:
         stamps = [datetime.fromisoformat(cell.strip()) for cell in cells]

@@ -147,6 +147,16 @@ def test_hhmmss(tmp_path):
         assert found.tolist() == list(seconds)
 
 
+@pytest.mark.parametrize("header", ["time", "time [min:s]"])
+def test_times_that_may_be_minutes_and_seconds(tmp_path, header):
+    """00:23 of a stopwatch was 23 minutes. Control: with seconds it is a time of day."""
+    found = timed(tmp_path, header, ("00:23", "01:24", "02:26"))
+    assert "time_s" not in found.data
+    assert "neither times of day HH:MM:SS nor stamps" in " ".join(found.remarks)
+    whole = timed(tmp_path, "time", ("00:00:23", "00:01:24", "00:02:26"))
+    assert whole.data["time_s"].values.tolist() == [0.0, 61.0, 123.0]
+
+
 def test_own_times_that_are_no_seconds_are_refused(tmp_path):
     path = tmp_path / "map.csv"
     lines = "".join(f"0,0,0.0{n},0.1,{t}\n" for n, t in enumerate((142355, 142359, 142401)))

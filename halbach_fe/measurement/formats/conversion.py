@@ -359,9 +359,12 @@ def _remarks(
             said.append(f"'{column.text}' is not zero, up to {np.nanmax(np.abs(values)):.4g}: of a "
                         "field that changes in time only the real part was read.")
         elif names.is_time(column):
-            looks = look_like_clock(values)
-            said.append(f"The times in '{column.text}' are not used, as their unit is not stated"
-                        f"{' (they look like HHMMSS)' if looks else ''}: state "
+            why = "their unit is not stated"
+            if table.texts.get(index):
+                why = "they are neither times of day HH:MM:SS nor stamps 2024-05-31T14:23:59"
+            elif look_like_clock(values):
+                why += " (they look like HHMMSS)"
+            said.append(f"The times in '{column.text}' are not used, as {why}: state "
                         "t[s], t[min], t[h] or t[hhmmss] in its place in --columns.")
         elif names.noise_of(column.text, column.text.lower()) in names.POSITIONS:
             said.append(f"The uncertainty of positions in '{column.text}' is not used: "
