@@ -597,7 +597,8 @@ def joined_answer(joined: JoinedMaps) -> Answer:
     trust, step = (
         (f"No: where {worst.name} overlaps other maps, the readings contradict each other, with "
          f"chi² {worst.chi2:.3g} per reading. The bars are widened by its root.",
-         "Look for what changed between the maps: temperature, gain, positions of the stage, or the magnet.")
+         "Look for what changed between the maps: temperature, gain, positions of the stage, or "
+         "the magnet.")
         if not joined.agree else
         (f"Only if the stage of {in_a_row(turned)} stood turned by right angles: with the axes "
          "that it states, no place fits. A smooth field is much like itself elsewhere.",
