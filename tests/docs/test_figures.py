@@ -45,6 +45,7 @@ QUOTED = {
     ("docs/accuracy.md", "longest, for five cubes"): ("iron_any.time_over_ngsolve",),
     ("docs/accuracy.md", "five cubes on a plate"): ("iron_any.error_back_plate",),
     ("docs/accuracy.md", "two blocks on the arms of a C"): ("iron_any.error_c_yoke",),
+    ("docs/accuracy.md", "hybrid undulator of three periods"): ("iron_any.error_undulator",),
     ("docs/accuracy.md", "processor time |"): ("iron_any.columns_time_over_field",),
     ("docs/accuracy.md", "memory of process and GetDP at most"): ("iron_any.memory_GiB",),
     ("docs/accuracy.md", "nominal magnet after registration"): (
