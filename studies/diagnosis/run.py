@@ -71,7 +71,6 @@ from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
-from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0
@@ -312,16 +311,18 @@ def true_axis(campaign: SimulatedCampaign, magnet: Magnet) -> list[float]:
     points = np.array([[radius * np.cos(turn), radius * np.sin(turn), z]
                        for z in heights for turn in turns])
 
-    def multipole(number: int, source: TrueMagnet) -> np.ndarray:
+    field, nominal = (true_field(source, points).reshape(len(heights), count, 3)
+                      for source in (campaign.magnet, magnet_of(campaign.study)))
+
+    def multipole(number: int, field: np.ndarray) -> np.ndarray:
         """Complex coefficient at each height."""
-        field = true_field(source, points).reshape(len(heights), count, 3)
         return (field[..., 1] + 1j * field[..., 0]) @ np.exp(-1j * (number - 1) * turns) / count
 
-    main = multipole(order, campaign.magnet)
-    roll = -float(np.angle(np.conj(multipole(order, magnet_of(campaign.study))) @ main)) / order
+    main = multipole(order, field)
+    roll = -float(np.angle(np.conj(multipole(order, nominal)) @ main)) / order
     if order == 1:
         return [roll]
-    places = -radius / (order - 1) * multipole(order - 1, campaign.magnet) / main
+    places = -radius / (order - 1) * multipole(order - 1, field) / main
     line = np.polynomial.polynomial.polyfit(heights, places, 0 if flat else 1)
     return [roll, *(float(part) for value in line for part in (value.real, value.imag))]
 
