@@ -10,7 +10,7 @@ cells, but the share of the volume past the knee converges.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -114,8 +114,8 @@ class DemagnetizationMap(ShownInNotebook):
         middles miss what is past the knee in parts of cells alone, as at faces and edges.
     along_error : float, in A/m
         Error bar of H in the middles that the cells leave in which permeability is solved for: in
-        the block with the strongest opposed field. It is 0 for other routes, beside iron, and of
-        blocks that are not uniform.
+        the block with the smallest margin. It is 0 for other routes, beside iron, and of blocks
+        that are not uniform.
     """
 
     magnet: Magnet
@@ -339,16 +339,17 @@ def demagnetization_map(
     along, outside = (np.einsum("nc,nc->n", each, easy[number]) for each in (field, fixed))
     cell = np.append(np.flatnonzero(~opposed), cell)
     used = np.append(np.flatnonzero(~opposed), np.arange(len(opposed), len(number)))
-    return DemagnetizationMap(magnet, material, blocks, cells, along[:len(opposed)], Places(
+    here = DemagnetizationMap(magnet, material, blocks, cells, along[:len(opposed)], Places(
         cell, (cells.volumes / np.maximum(1, np.bincount(cell, minlength=len(opposed))))[cell],
-        along[used], outside[used]), _error_in_worst_block(
-            warm, cells, along[:len(opposed)], easy, session))
+        along[used], outside[used]))
+    return replace(here, along_error=_error_in_worst_block(warm, here, easy, session))
 
 
 def _error_in_worst_block(
-    magnet: Magnet, cells: Cells, along: Floats, easy: Floats, session: Session
+    magnet: Magnet, found: DemagnetizationMap, easy: Floats, session: Session
 ) -> float:
-    """Return the error bar in A/m of H ``along`` (cells,) easy axes (blocks, 3) in the middles.
+    """Return the error bar in A/m of H along easy axes (blocks, 3) in the middles of the cells of
+    the block with the smallest margin.
 
     In one block the deviation of the polarization from its mean has a closed form, which the cells
     of the method of moments have not, see `halbach_fe.solver.moments.solve.field_within`.
@@ -357,14 +358,15 @@ def _error_in_worst_block(
     if magnet.is_vacuum or magnet.iron or magnet.has_losses or not _by_moments(reacting) or any(
             len(block.parts) > 1 for block in magnet.blocks):
         return 0.0
-    number = cells.block[np.argmin(along)]
+    cells = found.cells
+    number = cells.block[np.argmin(found.margin)]
     here = cells.block == number
     points = cells.middles[here]
     reaction, bar = reaction_within(
         reacting, points, cells.block[here], solve_separate(reacting, session, estimate=False))
     strength = _vacuum_field(magnet.blocks, points, None) + reaction + external_field(
         magnet, points)
-    off = np.abs(strength @ easy[number] / MU_0 - along[here])
+    off = np.abs(strength @ easy[number] / MU_0 - found.along[here])
     return float(np.max(off + np.linalg.norm(bar, axis=1) / MU_0))
 
 

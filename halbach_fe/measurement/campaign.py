@@ -285,7 +285,8 @@ def _copies_with_offset(points: Floats, field: Floats, noise: float) -> tuple[in
         difference = (read[apart:] - read[:-apart])[same]
         offset = np.median(difference, axis=0)
         count = int((np.abs(difference - offset) <= within).all(axis=1).sum())
-        if _no_chance(count, len(difference), field, noise, steps=3):
+        # one of them is what the offset is taken from, and proves nothing
+        if _no_chance(count - 1, len(difference) - 1, field, noise, steps=3):
             return count, offset
     return 0, np.zeros(field.shape[1])
 

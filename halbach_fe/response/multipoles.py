@@ -32,7 +32,7 @@ from scipy.integrate import quad_vec
 
 from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, rms, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
+from halbach_fe.core.numbers import HIGHEST_ORDER, check_number, decimals
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.coils import crosses_disc, distance_from_axis, distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
@@ -327,7 +327,7 @@ def multipole_models(
         offset, error = _complexes(model.offset[part]), model.error[part]
         index = np.array([main, *orders]) - 1
         place = ("The field integrated along z" if integrated
-                 else f"The circle at z = {1e3 * (z or 0.0):.4g} mm")
+                 else f"The circle at z = {decimals(1e3 * (z or 0.0), 4)} mm")
         why = "a coil or dipole within the circle, and no multipoles there: its table"
         try:
             if integrated:

@@ -22,6 +22,7 @@ from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.report.demagnetization import answer, demagnetization_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.grades import grade
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
@@ -287,6 +288,29 @@ def test_single_cells_of_a_permeable_cube_have_a_bar(session):
         {"kind": "box", "size_m": [0.01, 0.01, 0.01], "centre_m": [0.03, 0.0, 0.0]}]})
     assert "inner corners of iron" in answer(replace(bare, magnet=beside)).trust
     assert "inner corners of iron" not in answer(bare).trust
+
+
+def test_the_error_bar_is_that_of_the_smallest_margin(session):
+    """Of two cubes far apart the one of the weaker grade has the smallest margin, though H is
+    largest in the other, whose permeability is 1 and leaves no error. The bar is that of the weaker
+    cube alone, but for what is left of the other's field, 1e-3 of H.
+    """
+    side = 0.01
+
+    def map_of(x_m, material, permeability):
+        one = [side] * len(x_m)
+        return demagnetization_map(magnet_of_blocks({
+            "shape": ["cuboid"] * len(x_m), "x_m": x_m, "y_m": [0.0] * len(x_m),
+            "z_m": [0.0] * len(x_m), "size_x_m": one, "size_y_m": one, "size_z_m": one,
+            "material": material, "recoil_permeability": permeability}).with_(
+                demagnetization={
+                    **grade(material[0]).demagnetization_defaults, "temperature_C": 60.0}), session)
+
+    both = map_of([0.0, 0.2], ["N42SH", "N35"], [1.0, 1.1])
+    alone = map_of([0.2], ["N35"], [1.1])
+    assert both.cells.block[np.argmin(both.along)] == 0
+    assert both.cells.block[np.argmin(both.margin)] == 1
+    assert both.along_error == pytest.approx(alone.along_error, rel=0.1)
 
 
 def test_permeability_and_iron_against_ngsolve(short_dipole, session):

@@ -129,6 +129,9 @@ def test_a_copy_with_another_zero_within_one_file(generator, digits):
     uniform = np.broadcast_to([0.1, 0.0, 0.02], GRID.shape)
     few = read(generator, 4, SIGMA / 10, uniform)
     maps_of(study(), twice(few, few + 1e-4))
+    for visits in (1, 3, 9):
+        rows = np.append(np.arange(len(GRID)), np.zeros(visits, int))
+        maps_of(study(), field_map(GRID[rows], read(generator, digits, field=FIELD[rows])))
 
 
 def test_a_field_along_z_in_two_dimensions_is_told(generator):

@@ -287,6 +287,15 @@ def test_an_integral_that_has_sources_within_its_circle(session, external, named
     assert len(said) == 1
 
 
+def test_a_circle_that_is_left_out_is_named_without_its_rounding(session):
+    """One of 21 heights from -0.055 to 0.055 m is -7e-18 m."""
+    dipole = {"position_m": [0.0, 0.01, 0.0], "moment_A_m2": [0, 1e-4, 0]}
+    magnet = magnet_of_blocks(ALONE).with_(external={"dipoles": [dipole]})
+    circles = [MultipoleReference(0.02, (2, 3), z_m) for z_m in (-7e-18, 0.02)]
+    with pytest.warns(HalbachWarning, match=r"The circle at z = 0 mm has a coil or dipole within"):
+        multipoles.multipole_models(magnet, circles, session)
+
+
 def loop_beside_the_axis(x, half_length=0.1):
     """100 A up at x, and down at x = 0.3 m."""
     return {"coils": [{"kind": "polygon", "current_A": 100.0, "points_m": [

@@ -153,8 +153,8 @@ class KneeEffect(Effect):
 
     A place is a coercivity. The refinements are the logarithms of the coercivity relative to it and
     of the odds of the squareness, so that no step leads to impossible ones; reports state
-    coercivity and squareness. A temperature acts by the coercivity alone, which is that at the
-    temperature the magnet has had: the two cannot be told apart.
+    coercivity and squareness. A temperature acts by the ratio of coercivity and remanence alone,
+    which are those at the temperature the magnet has had: the two cannot be told apart.
     """
 
     name = "knee"
