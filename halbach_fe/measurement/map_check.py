@@ -443,7 +443,7 @@ def check_map(
     ------
     MeasurementError
         If fewer than `FEWEST_POINTS` points have all components of the map and are not broken, if
-        they lie on a line, or if the map holds what none does in m and T.
+        they lie on a line or circle, or if the map holds what none does in m and T.
 
     Examples
     --------
@@ -772,6 +772,18 @@ def _where(data: xr.Dataset) -> str:
     return f"map {data.encoding['source']}" if "source" in data.encoding else "map"
 
 
+def _is_curve(points: Floats) -> bool:
+    """Tell whether points (n, 3) lie on one line or circle, to a quarter of their spacing.
+
+    On these alone two equations hold that are linear in x, y, z and x^2 + y^2 + z^2.
+    """
+    placed = points - points.mean(axis=0)
+    square = np.sum(placed**2, axis=1)
+    size = float(np.sqrt(square.max()))
+    lifted = np.column_stack([placed, (square - square.mean()) / size]) / np.sqrt(len(points))
+    return bool(np.linalg.svd(lifted, compute_uv=False)[2] < point_spacing(points) / 4)
+
+
 def scan_of(
     data: xr.Dataset, pace: Pace | None = None
 ) -> tuple[Scan, NDArray[np.bool_], dict[str, list[int]]]:
@@ -795,10 +807,11 @@ def scan_of(
             _where(data), "Maxwell's check", f"of at least {FEWEST_POINTS} points with all its "
             "components, neither all zero nor repeated", f"{int(usable.sum())}",
             "A line of one component obeys Maxwell's equations whatever it is."))
-    if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
+    if _is_curve(points[usable]):
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", "of points in a plane or a volume",
-            "points on a line", "Along a line any field has div B = 0 and curl B = 0."))
+            "points on a line or circle",
+            "Along one curve a field with div B = 0 and curl B = 0 follows any readings."))
     if np.nanmax(np.abs(field[usable])) < smallest_field_t:
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", f"of a field of at least {smallest_field_t:g} T "

@@ -519,9 +519,15 @@ def test_what_no_magnet_makes_is_not_fitted(generator, spoiled):
 
 
 def test_a_small_map_cannot_tell(generator):
-    line = np.column_stack([np.zeros(40), np.zeros(40), np.linspace(-0.02, 0.02, 40)])
-    with pytest.raises(MeasurementError, match="on a line"):
-        check_map(field_map(line, source().getB(line)))
+    # a sound circle was said to have exchanged axes, and a line across the axes to obey
+    turn = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    circle = 0.012 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn]) + [0.0, 0.0, 0.003]
+    line = np.linspace(-0.02, 0.02, 40)[:, None]
+    for curve in (line * [0, 0, 1], line * [0.5, 0.6, 0.7], circle, circle[:30]):
+        with pytest.raises(MeasurementError, match="on a line or circle"):
+            check_map(field_map(curve, source().getB(curve)))
+    control = np.concatenate([circle, circle * [1, 1, -1]])
+    assert check_map(field_map(control, source().getB(control))).points == 64
     with pytest.raises(MeasurementError, match="at least 30 points"):
         check_map(field_map(GRID[:9], source().getB(GRID[:9])))
     for wrong in (0 * GRID, np.ones_like(GRID)):
