@@ -217,9 +217,7 @@ def test_refusals_of_writing(tmp_path):
 
 
 def test_100_000_blocks(tmp_path):
-    """Reading and validation take 3 s of processor time, measured on two slow, busy cores; twice
-    that is allowed.
-    """
+    """A change of other keys does not validate the blocks again, as reading does."""
     count = 100_000
     number = np.arange(count)
     columns = {
@@ -233,8 +231,8 @@ def test_100_000_blocks(tmp_path):
     (tmp_path / "study.toml").write_text(STUDY, encoding="utf-8")
     start = time.process_time()
     study = read_study(tmp_path / "study.toml")
-    assert time.process_time() - start < 6
+    reading = time.process_time() - start
     start = time.process_time()
     study.with_(mesh__growth=1.7, array__recoil_permeability=1.06)
-    assert time.process_time() - start < 0.5
+    assert time.process_time() - start < reading / 3  # a twelfth was measured
     assert study.array.free_blocks.remanence_x_T == tuple(columns["remanence_x_T"])
