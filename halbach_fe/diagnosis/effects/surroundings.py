@@ -220,11 +220,15 @@ class IronRingEffect(Effect):
 
     A place is a pair of inner and outer radius, and the refinements adjust both. The iron is
     linear: iron that saturates is not a candidate, and is identified as a linear tube that is
-    thicker and farther out.
+    thicker and farther out. Blocks take up the rest: in the update of a magnet in a saturating tube
+    of 4.6 mm, their combinations were up to 31 standard deviations (1 % of a block) off.
     """
 
     name = "iron_ring"
     title = "iron ring around the magnet"
+    neglects = ("The ring is taken for iron that does not saturate. If it does, another thickness "
+                "and the blocks make up for that, and the error bars of the blocks are too short: "
+                "put the ring that was measured, with its H(B) curve, into the study.")
     is_solved = True
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
