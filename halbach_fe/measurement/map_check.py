@@ -464,6 +464,11 @@ def check_map(
     _begin(pace, 2, "comparing the orientations of the probe")
     some = _thinned(scan.of(rows.train))
     matrix, alike = _orientation(some, pace)
+    if not np.array_equal(matrix, as_given := np.eye(3)):
+        turned, given = (_log_evidence(scan.of(rows.few).turned(each), some.turned(each), pace)
+                         for each in (matrix, as_given))
+        if turned - given < ALIKE:
+            matrix, alike = as_given, (_named(matrix), *alike) if given - turned < ALIKE else ()
     _begin(pace, 3, "fitting the field and the instrument")
     fitted, gap = _first_fit(scan.turned(matrix), some.turned(matrix), rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
@@ -936,6 +941,16 @@ def _gap(scan: Scan, some: ProbeModel, pace: Pace) -> tuple[float, ProbeFit, Har
     pace.advance(FIRST_FIT_PARTS // 3, FIRST_FIT_PARTS)
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe, fit
+
+
+def _log_evidence(scan: Scan, some: ProbeModel, pace: Pace) -> float:
+    """Return that of a scan by charges as near as its readings ask for.
+
+    By those of one distance, by which orientations are compared, wrong axes may fit better: maps of
+    two circles or lines see few of these, and a field that needs nearer ones.
+    """
+    _, probe, fit = _gap(scan, some, pace)
+    return fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
 
 
 def _read_at(points: Floats, sensors: Floats) -> Floats:
