@@ -283,11 +283,18 @@ def sentences(check: MapCheck) -> list[str]:
                      + (f"; and {others} more of the parameters in the table" if others > 0
                         else "")
                      + ".")
+    if any(term.name.startswith("gain of") for term in terms):
+        found.append(STRETCHED)
     found += [f"One of these is off, and the map does not tell which: {'; '.join(names)}."
               for names in dict.fromkeys(tuple(sorted((term.name, *term.rivals)))
                                          for term in check.terms if term.rivals)]
     return found
 
+
+STRETCHED = (
+    "A stage that is stretched along an axis is read as gains that differ by about as much, which "
+    "this check does not tell apart: compare its scale with a ruler before you correct gains.")
+"""What gains of single components may be instead: of a z that was 1 % too long, +0.7 % of Bz."""
 
 NOT_WHOLE = (
     "{} by itself obeys where it is harmonic, as each component of a field without sources is. "
