@@ -464,13 +464,9 @@ def check_map(
     _begin(pace, 2, "comparing the orientations of the probe")
     some = _thinned(scan.of(rows.train))
     matrix, alike = _orientation(some, pace)
-    if not np.array_equal(matrix, as_given := np.eye(3)):
-        turned, given = (_log_evidence(scan.of(rows.few).turned(each), some.turned(each), pace)
-                         for each in (matrix, as_given))
-        if turned - given < ALIKE:
-            matrix, alike = as_given, (_named(matrix), *alike) if given - turned < ALIKE else ()
     _begin(pace, 3, "fitting the field and the instrument")
-    fitted, gap = _first_fit(scan.turned(matrix), some.turned(matrix), rows, pace)
+    matrix, alike, placed = _confirmed(matrix, alike, scan.of(rows.few), some, pace)
+    fitted = _first_fit(scan.turned(matrix), placed, rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
     fitted, terms = _stated(fitted, scan, rows.train, pace)
     _begin(pace, 5, "fitting all scan lines")
@@ -482,7 +478,7 @@ def check_map(
         order=_order(data),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=gap,
+        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=placed.gap_m,
         **_remaining(fitted, whole, scan, matrix, rows))
 
 
@@ -712,28 +708,23 @@ class _Rows:
         return found
 
 
-def _first_fit(
-    scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace
-) -> tuple[_Fitted, float]:
-    """Return the fit of the field and of all parameters of the instrument to a few lines, and the
-    distance in m of the charges.
+def _first_fit(scan: Scan, placed: _Placed, rows: _Rows, pace: Pace) -> _Fitted:
+    """Return the fit of the field and of all parameters of the instrument to a few lines.
 
-    The combinations of charges are those that all chosen rows determine. ``some`` points of the
-    scan tell what the fit starts from, and where the charges are.
+    The combinations of charges are those that all chosen rows determine.
     """
-    few = rows.few
-    gap, probe, fit = _gap(scan.of(few), some, pace)
+    few, probe = rows.few, placed.probe
     # around all rows, of which those that are not fitted are read too
-    charges = Charges.around(_read_at(scan.points[rows.usable], probe.sensors_m), gap)
+    charges = Charges.around(_read_at(scan.points[rows.usable], probe.sensors_m), placed.gap_m)
     model = scan.model(charges)
     start = replace(model.start(NO_FIT), instrument=probe.instrument)
-    model = model.few(start, rows.chosen, fit.penalty)
+    model = model.few(start, rows.chosen, placed.fit.penalty)
     pace.advance(2 * FIRST_FIT_PARTS // 3, FIRST_FIT_PARTS)
     fit = model.fit(start, few)
     start = replace(start, amplitudes=fit.amplitudes, sigma=fit.sigma)
     fitted = _Fitted(model, fit_probe(model, few, fit, start), fit).weighted(few)
     pace.advance(FIRST_FIT_PARTS, FIRST_FIT_PARTS)
-    return fitted, gap
+    return fitted
 
 
 def _without_spikes(
@@ -908,49 +899,72 @@ def _linear_against(model: ProbeModel, fit: HarmonicFit) -> float:
         1 - told.sums @ instrument / readings) / 2) + instrument @ instrument / 2)
 
 
-def _gap(scan: Scan, some: ProbeModel, pace: Pace) -> tuple[float, ProbeFit, HarmonicFit]:
-    """Return the distance in m of the charges, the instrument, and the fit of the field.
+@dataclass(frozen=True)
+class _Placed:
+    """Charges as near as the readings of a scan ask for."""
 
-    The distance is that from where sensors read the field. The instrument is perfect, or is first
-    fitted to ``some`` points. Charges are tried from far to near, which are more, until the
-    evidence of the readings falls.
+    gap_m: float
+    """Their distance from where sensors read the field."""
+    probe: ProbeFit
+    """The instrument with which they were tried."""
+    fit: HarmonicFit
+    """The fit of the field."""
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of the readings, with the prior of the instrument."""
+        return self.fit.log_evidence - float(self.probe.instrument @ self.probe.instrument) / 2
+
+
+def _placed(scan: Scan, some: ProbeModel, pace: Pace) -> _Placed:
+    """Return the charges of a scan.
+
+    The instrument is perfect, or is first fitted to ``some`` points. Charges are tried from far to
+    near, which are more, until the evidence of the readings falls.
     """
     spacing, perfect = point_spacing(scan.points), some.start(NO_FIT)
     every = np.ones(len(some.points), bool)
     first = some.fit(perfect, every)
     probe, every = fit_probe(some, every, first), np.ones(len(scan.points), bool)
-    found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
+    found: list[_Placed] = []
 
-    def evidence(gap: float, probe: ProbeFit) -> float:
-        charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap * spacing)
-        fit = scan.model(charges).fit(probe, every)
-        found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
-                      probe, fit))
+    def tried(gap_m: float, probe: ProbeFit) -> float:
+        charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap_m)
+        found.append(_Placed(gap_m, probe, scan.model(charges).fit(probe, every)))
         pace.advance(len(found), FIRST_FIT_PARTS)
-        return found[-1][0]
+        return found[-1].log_evidence
 
     last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
     for gap in reversed(GAPS):
         near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
         if near or gap == GAPS[-1]:
-            now = evidence(gap, probe)
+            now = tried(gap * spacing, probe)
             if now < last:
                 break
             last = now
-    evidence(max(found, key=lambda each: each[0])[1], some.start(first))
+    tried(max(found, key=lambda each: each.log_evidence).gap_m, some.start(first))
     pace.advance(FIRST_FIT_PARTS // 3, FIRST_FIT_PARTS)
-    _, gap, probe, fit = max(found, key=lambda each: each[0])
-    return gap * spacing, probe, fit
+    return max(found, key=lambda each: each.log_evidence)
 
 
-def _log_evidence(scan: Scan, some: ProbeModel, pace: Pace) -> float:
-    """Return that of a scan by charges as near as its readings ask for.
+def _confirmed(
+    matrix: Floats, alike: tuple[tuple[str, str, str], ...], scan: Scan, some: ProbeModel,
+    pace: Pace
+) -> tuple[Floats, tuple[tuple[str, str, str], ...], _Placed]:
+    """Return the matrix of the orientation, others that fit as well, and the charges for it.
 
-    By those of one distance, by which orientations are compared, wrong axes may fit better: maps of
-    two circles or lines see few of these, and a field that needs nearer ones.
+    Charges of one distance, by which orientations are compared, may fit better with wrong axes:
+    maps of two circles or lines determine few of them, and their field may need nearer ones. Other
+    axes than those that are given must therefore be likelier by charges as near as needed, too.
     """
-    _, probe, fit = _gap(scan, some, pace)
-    return fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
+    placed, given = _placed(scan.turned(matrix), some.turned(matrix), pace), np.eye(3)
+    if np.array_equal(matrix, given):
+        return matrix, alike, placed
+    as_given = _placed(scan, some, pace)
+    better = placed.log_evidence - as_given.log_evidence
+    if better >= ALIKE:
+        return matrix, alike, placed
+    return given, (_named(matrix), *alike) if better > -ALIKE else (), as_given
 
 
 def _read_at(points: Floats, sensors: Floats) -> Floats:

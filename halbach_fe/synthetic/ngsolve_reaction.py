@@ -74,8 +74,8 @@ class Elements:
     grading: float = 0.3
     """Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast)."""
     mirrored: tuple[int, int, int] = (0, 0, 0)
-    """How the potential of a magnet changes if x, y or z is mirrored: 1 if it is the same, -1 if it
-    changes its sign, 0 if nothing is known. What is mirrored is not meshed."""
+    """How the potential in three dimensions changes if x, y or z is mirrored: 1 if it is
+    the same, -1 if it changes its sign, 0 if nothing is known. What is mirrored is not meshed."""
 
 
 def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None = None) -> Floats:
