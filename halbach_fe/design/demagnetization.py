@@ -113,9 +113,9 @@ class DemagnetizationMap(ShownInNotebook):
         H along the magnetization anywhere in the cells, of which shares and limits follow: the
         middles miss what is past the knee in parts of cells alone, as at faces and edges.
     along_error : float, in A/m
-        Error bar of H in the middles that the cells leave in which permeability is solved for: in
-        the block with the smallest margin. It is 0 for other routes, beside iron, and of blocks
-        that are not uniform.
+        Error bar of H in the middles of the block with the smallest margin, by the cells in which
+        its permeability is solved for. It is 0 for other routes, beside iron, and of blocks that
+        are not uniform.
     """
 
     magnet: Magnet

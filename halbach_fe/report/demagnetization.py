@@ -187,8 +187,8 @@ def _trust(found: DemagnetizationMap, state: _Losses) -> str:
                      f" ± {_percent(found.share_error)} % is what the share of the volume depends "
                      "on the places in the cells that were computed.")]
     if found.along_error:
-        sentences.append("The error bar of the margin is what the cells leave in which "
-                         "permeability is solved for (mesh.cells_per_side).")
+        sentences.append("The margin's error bar is that of the block's permeability, which is "
+                         "solved for in cells (mesh.cells_per_side sets their number).")
     if found.magnet.iron:
         sentences.append("At edges and inner corners of iron H has no bound either: within the "
                          "elements of the iron there its values in cells are not known.")
@@ -233,8 +233,11 @@ def page(found: DemagnetizationMap) -> Page:
     summary, blocks, material = demagnetization_summary(found), found.by_block(), found.material
     rows = _worst_block_table(blocks)
     reference_C = f"{material.reference_temperature_C:g} °C"
-    knees = "; of other blocks at ".join(
-        f"|H| = {1e-3 * knee_now(kind):.0f} kA/m: {kind.squareness:g} times the intrinsic "
+    grades = dict(zip(found.magnet.demagnetizations, found.magnet.materials, strict=True))
+    knees = "; ".join(
+        f"at |H| = {1e-3 * knee_now(kind):.0f} kA/m"
+        + (f" in blocks of {grades[kind] or 'no grade'}" if len(found.kinds) > 1 else "")
+        + f": {kind.squareness:g} times the intrinsic "
         f"coercivity, which is {1e-3 * kind.intrinsic_coercivity_A_per_m:.0f} kA/m at "
         f"{kind.reference_temperature_C:g} °C and changes by "
         f"{100 * kind.coercivity_coefficient_per_K:g} % per kelvin (the remanence by "
@@ -245,7 +248,7 @@ def page(found: DemagnetizationMap) -> Page:
             "H is the field strength in the nominal magnet along each block's magnetization, in "
             f"{len(found.along)} cells. It is the exact field of the blocks in vacuum plus the "
             "finite-element field that the permeability of the blocks and the iron add. At this "
-            f"temperature the knee is at {knees}.",
+            f"temperature the knee is {knees}.",
             Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
                  "falls slightly with smaller cells (--across); shares of the volume converge. Not "
                  "modelled: fields across the easy axis, which demagnetize less, and the field "

@@ -103,7 +103,8 @@ def test_every_block_by_its_own_grade(session, of_array):
         assert both.share_beyond(np.array([temperature])) == pytest.approx(
             np.mean(shares), abs=5e-3)
     said = str(page(both).sections[0])
-    assert "; of other blocks at |H| = " in said
+    assert " kA/m in blocks of N42SH: " in said
+    assert " kA/m in blocks of N42: " in said
     hard = demagnetization_map(cubes_of(["N42SH", "N42"], of_array,
                                         intrinsic_coercivity_A_per_m=2e6), session)
     assert hard.share_beyond_now == 0
