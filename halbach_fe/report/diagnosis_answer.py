@@ -534,7 +534,6 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "The magnet is the same from several sides, so that the readings may be displaced by "
             f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
             "first is used here.")
-    sentences += filter(None, (one.hypothesis.effect.neglects for one in diagnosis.identified))
     names = [effect.hypothesis.effect.name for effect in diagnosis.identified]
     sources = [title_of(name, titles) for name in names if name in OTHER_SOURCES]
     if "neighbour_magnet" in names and sources:

@@ -263,20 +263,6 @@ def test_verdicts(flat, tmp_path):
     assert "Yes: the readings are explained" in verdict(replace(nothing, before=fine, after=fine))
 
 
-def test_what_an_effect_neglects_forbids_a_plain_yes(flat, monkeypatch):
-    """A linear tube of iron that took the place of a saturating one left blocks 31 of their bars
-    off beside a plain "Yes".
-    """
-    found, _ = flat
-    (one,) = found.identified
-    assert answer(found).trust.startswith("Yes. ")
-    ring = EFFECTS["iron_ring"]
-    monkeypatch.setattr(type(one.hypothesis.effect), "neglects", ring.neglects)
-    trust = answer(found).trust
-    assert trust.startswith("Only in part. ")
-    assert ring.neglects in trust
-
-
 @pytest.mark.parametrize(("inner", "outer", "named", "said"), [
     (0.0, 0.0, [], "Yes: the readings are explained"),
     (0.02, 0.0, [], "No. Held-out readings are farther from their predictions"),

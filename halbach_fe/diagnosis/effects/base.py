@@ -148,8 +148,6 @@ class Effect(ABC):
         Whether it is an effect of probes of |B|, whose three columns have one sensor.
     relative_odds : float
         Prior odds that the effect is missing, relative to those of other effects.
-    neglects : str
-        What the effect leaves out although it may be there and blocks imitate it, as a sentence.
     is_solved : bool
         Whether signatures are differences of solved fields of whole magnets, which may take long.
         They are computed after all others, so that a time limit leaves these out last.
@@ -167,7 +165,6 @@ class Effect(ABC):
     is_divisible: bool = True
     of_total_field: bool = False
     relative_odds: float = 1.0
-    neglects: str = ""
     is_solved: bool = False
 
     @property
