@@ -418,10 +418,11 @@ class Magnet(ShownInNotebook):
 
     def with_(self, **changes: Any) -> Magnet:
         """Return the magnet of the same study with other values of some keys, see `Study.with_`."""
-        study = self.study.with_(**changes)
-        if study.external != self.external:
-            _doubt_external(study)
-        return self.with_study(study)
+        magnet = self.with_study(self.study.with_(**changes))
+        if any(getattr(magnet.study, key) != getattr(self.study, key)
+               for key in MAGNET_KEYS | {"external"}):
+            _doubt_sources(magnet)
+        return magnet
 
     def with_study(self, study: Study) -> Magnet:
         """Return the magnet of another study; blocks are built again only if they may differ."""
@@ -456,14 +457,31 @@ def build_magnet(study: Study) -> Magnet:
     >>> hf.build_magnet(hf.read_study("dipole.toml")).blocks[0].name
     'r01s01'
     """
-    _doubt_external(study)
-    return _built(study)
+    magnet = _built(study)
+    _doubt_sources(magnet)
+    return magnet
 
 
-def _doubt_external(study: Study) -> None:
-    """Warn of fields from outside that no surroundings have; a search may try them."""
-    for doubt in study.external.doubts:
-        warnings.warn(f"Study {study.name}: {doubt}", HalbachWarning, stacklevel=4)
+def _doubt_sources(magnet: Magnet) -> None:
+    """Warn of fields from outside that no surroundings have, and of sources that are so far from
+    each other along z that this may be in mm; a search may try them.
+    """
+    doubts = magnet.external.doubts
+    if magnet.dimension == 3:
+        blocks = (*magnet.blocks, *neighbour_blocks(magnet.blocks, magnet.external.neighbours))
+        half = np.array([-0.5, 0.5])
+        ends = np.array(sorted([tuple(one.mounted_middle[2] + half * (one.z_max - one.z_min))
+                                for one in blocks] + [
+            (float(body.surface[2].min()), float(body.surface[2].max())) for body in magnet.iron]))
+        gaps, radius = ends[1:, 0] - np.maximum.accumulate(ends[:-1, 1]), magnet.radius
+        if (far := float(gaps.max(initial=0.0))) and look_like_mm(
+                np.array([[far, 0.0, 0.0]]), radius)[0]:
+            doubts.append(
+                f"blocks, neighbours and iron leave {far:.3g} m between each other along z, and "
+                f"reach {radius:.3g} m from the axis: there is hardly any field in between. Are "
+                "z_m or gaps in mm? Then write 0.01 for 10 mm.")
+    for doubt in doubts:
+        warnings.warn(f"Study {magnet.name}: {doubt}", HalbachWarning, stacklevel=4)
 
 
 def _built(study: Study) -> Magnet:

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.core.errors import StudyError
@@ -69,6 +70,10 @@ PREDICTION_COLUMNS = (
 TOO_NEAR = 0.1
 """chi-squared per reading below which the noise or the prior is stated too large, by a factor of
 three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
+
+FEWEST_READINGS = 20
+"""Readings, beyond the parameters learnt, whose chi-squared is below that by chance with a
+probability of 1e-7. Of fewer it has to be smaller: of one, it is so in a quarter of all maps."""
 
 OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run `halbach-fe check` "
              "for the noise of the map.")
@@ -689,12 +694,9 @@ class InferenceResult(ShownInNotebook):
         explains as much as belongs to the parameters that it learns. The solver's error does not
         count as noise here. NaN if too few readings are left.
         """
-        # Readings beyond the parameters learnt from which their noise is judged. chi-squared of 20
-        # is below a tenth of its mean with a probability of 1e-9.
-        fewest_left = 20
         training = ~self.held_out
         count = float(training.sum()) - self.parameters_learnt
-        if count < fewest_left:
+        if count < FEWEST_READINGS:
             return np.nan
         left = self.noise.subset(training).whiten(
             (self.readings - self.prediction_posterior.mean)[training])
@@ -713,8 +715,10 @@ class InferenceResult(ShownInNotebook):
 
         Readings may be nearer than error bars that the solver makes: these are upper bounds.
         """
-        chi2 = self.prior_conflict
-        if chi2 < TOO_NEAR and self.solver_over_noise < 1:
+        chi2, readings = self.prior_conflict, float(np.sum(~self.held_out))
+        chance, least = (gammainc(count / 2, count * least / 2) for count, least in (
+            (readings, chi2), (FEWEST_READINGS, TOO_NEAR)))
+        if chi2 < TOO_NEAR and chance < least and self.solver_over_noise < 1:
             return (f"The readings are {_times_nearer(chi2)} times nearer to the "
                     "model than their noise and the prior allow (chi² per reading is "
                     f"{chi2:.2g}, where 1 is expected): sigma_T, position_sd_m or prior is too "

@@ -50,6 +50,9 @@ T = TypeVar("T")
 LITTLE = 0.05
 """Part of the rms below which the gain of all moves together is called hardly worth the work."""
 
+LIKELY = 0.5
+"""Probability below which the answer says that a limit is not reached."""
+
 STUDY_FILE = "study.shimmed.toml"
 
 DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
@@ -104,6 +107,12 @@ def aim_of(model: MultipoleModel | DeviationModel) -> Aim:
     return Aim("the unwanted multipoles are", "units", "units of 1e-4 rms",
                "Multipoles in units of 1e-4", "the unwanted multipoles in units of 1e-4", "numbers",
                "{:.3g}".format, "multipoles")
+
+
+def within_limit(model: MultipoleModel | DeviationModel, limit: float) -> str:
+    """Return what a limit asks for, in words."""
+    return (f"The deviation is within {ppm(limit)} ppm rms" if isinstance(model, DeviationModel)
+            else f"All unwanted multipoles are within {limit:g} units")
 
 
 def values_summary(
@@ -221,13 +230,10 @@ def _placement_text(shim: Shim, placement: Placement) -> str:
 
 def answer(shim: Shim) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
-    likely = 0.5  # probability below which the answer says that moves do not reach the limit
     question = "Which blocks should be exchanged, turned or replaced?"
     aim = aim_of(shim.model)
     before, after = (aim.size(rms) for rms in _sizes(shim))
     what, unit = aim.what, aim.rms_unit
-    within = ("All unwanted multipoles are within {} units" if shim.fields is None else
-              "The deviation is within {} ppm rms")
     if shim.steps:
         moves = counted(len(shim.steps), "move")
         ranged = "" if shim.fields is None else " (95 %: {} to {})".format(
@@ -249,10 +255,9 @@ def answer(shim: Shim) -> Answer:
                 + f"{what} {before} {unit}, including the uncertainty{_unknown_part(shim)}.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
-        limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
-        said += f" {within.format(limit)} with a probability of {first}"
+        said += f" {within_limit(shim.model, shim.limit)} with a probability of {first}"
         said += f" before and {last} after." if shim.steps else "."
-        if shim.steps and shim.within[1] < likely:
+        if shim.steps and shim.within[1] < LIKELY:
             said += " These moves do not reach that limit."
     ended = f"The search ended because {STOPS[shim.stop]}."
     if shim.result.disagreement:

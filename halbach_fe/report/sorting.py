@@ -18,6 +18,7 @@ from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES
 from halbach_fe.report.multipoles import (
+    DRAWS,
     at_z,
     lacks_main,
     main_in_words,
@@ -40,8 +41,8 @@ from halbach_fe.report.page import (
     csv_file,
     legend_above,
 )
-from halbach_fe.report.shimming import aim_of, values_summary, values_table
-from halbach_fe.report.words import counted, in_a_row, ppm
+from halbach_fe.report.shimming import LIKELY, aim_of, values_summary, values_table, within_limit
+from halbach_fe.report.words import counted, in_a_row, ppm, probability
 
 T = TypeVar("T")
 
@@ -67,7 +68,25 @@ def _summary(found: SortedBlocks) -> Plain:
         f"rms_random_{unit}": dict(zip(map(str, QUANTILES), np.quantile(
             found.random, QUANTILES).tolist(), strict=True)),
         f"best_random_{unit}": float(found.random.min()),
+        "probability_within_limit": _within(found),
     }
+
+
+def _within(found: SortedBlocks) -> float | None:
+    """Return the probability that the sorted blocks meet the limit; None without one."""
+    if found.limit is None:
+        return None
+    normals = np.random.default_rng(1).standard_normal((DRAWS, len(found.best.mean)))
+    return float(found.best.share_within(found.limit, normals))
+
+
+def _limit(found: SortedBlocks) -> str:
+    """Say how probably the sorted blocks meet the limit; nothing without one."""
+    share = _within(found)
+    if share is None or found.limit is None:
+        return ""
+    return (f" {within_limit(found.model, found.limit)} with a probability of {probability(share)}."
+            f"{' Sorting does not reach that limit.' if share < LIKELY else ''}")
 
 
 def _turned_rows(found: SortedBlocks) -> list[int]:
@@ -145,16 +164,20 @@ def _answer(found: SortedBlocks) -> Answer:
     if found.has_choice and not _chose(found):
         return Answer(
             question, f"It does not matter: {what} {text(best)} {unit} in every order that is "
-            f"allowed.{left}", f"Yes: {len(found.random)} random orders are alike. Only blocks "
-            "that are at the same angle may change places, in rings whose fields add up along z.",
+            f"allowed.{_limit(found)}{left}", f"Yes: {len(found.random)} random orders are alike. "
+            + ("Only blocks that are at the same angle may change places, in rings whose fields "
+               "add up along z." if all(
+                   len(slots) == 1 for slots in found.study.prior.types.values()) else
+               "The blocks that may change places are alike as measured, or are so in what is "
+               "asked for."),
             f"To have a choice, {_more(found)}. Then sort again.",
             f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
     if not _chose(found):
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
-            f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, as they "
-            "lie, and here every slot has its own. (halbach-fe shim also turns blocks upside "
-            "down.)", "If blocks of some slots are alike, say so in the study "
+            f"{text(best)} {unit}.{_limit(found)}", "Yes: blocks go only into slots of their own "
+            "type, as they lie, and here every slot has its own. (halbach-fe shim also turns "
+            "blocks upside down.)", "If blocks of some slots are alike, say so in the study "
             f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
             "again.",
             f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
@@ -179,7 +202,7 @@ def _answer(found: SortedBlocks) -> Answer:
         f"{hardly}The slot of each block is in the table of places, which opens below, and in "
         f"blocks.sorted.csv. In these slots {what} "
         f"{text(best)} {unit}{sizes}; with the blocks {found.own_order} it would be "
-        f"{text(own)}, and {orders}.{left}{turned}",
+        f"{text(own)}, and {orders}.{_limit(found)}{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "
         "added by squares, whatever the order"
         f"{'' if spread <= best else ': more than what sorting leaves'}. Blocks go only into slots "

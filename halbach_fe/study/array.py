@@ -20,10 +20,10 @@ from halbach_fe.study.grades import (
 )
 from halbach_fe.study.types import (
     Angle,
-    Coordinate,
     Displacement,
     Gap,
     Length,
+    Place,
     RecoilPermeability,
     Remanence,
     Rotation,
@@ -195,7 +195,7 @@ class Ring(_OfGrade):
 
     count: Annotated[int, Field(ge=1, le=MAX_RINGS)] = 1
     layer: Annotated[int, Field(ge=1, le=100)] = 1
-    z_m: Coordinate | None = None
+    z_m: Place | None = None
     multipole_order: MultipoleOrder | None = None
     blocks_per_ring: BlocksPerRing | None = None
     inner_radius_m: Length | None = None

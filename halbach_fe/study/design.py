@@ -10,10 +10,10 @@ from halbach_fe.study.array import BlocksPerRing
 from halbach_fe.study.grades import Material
 from halbach_fe.study.types import (
     Angle,
-    Coordinate,
     Gap,
     Length,
     Line,
+    Place,
     Point,
     Remanence,
     StudyModel,
@@ -115,7 +115,7 @@ class TrayRing(StudyModel):
 
     radius_m: Length
     count: Annotated[int, Field(ge=1, le=MOST_PLACES)]
-    z_m: Annotated[tuple[Coordinate, ...], one_or_list(Coordinate), Field(min_length=1)] = (0.0,)
+    z_m: Annotated[tuple[Place, ...], one_or_list(Place), Field(min_length=1)] = (0.0,)
     first_angle_deg: Angle = 0.0
 
 

@@ -229,6 +229,11 @@ class MapSettings(StudyModel):
 OF_INSTRUMENTS = ("instrument.", "maps[")
 """Beginnings of the names of numbers that describe an instrument, and not the magnet."""
 
+OF_READINGS = re.compile(
+    r"array\.|iron\.|iron_ring\.|external\.|demagnetization\.|"
+    r"(maps\[\d+\]\.)?instrument\.(?!length_unit_m$|flux_density_unit_T$)")
+"""Beginnings of the names of numbers that change readings. Units change the numbers of a file."""
+
 Derivative = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -273,9 +278,23 @@ def check_uncertain(study: Study) -> None:
         if any(of_instrument) and not all(of_instrument):
             raise ValueError(f"uncertain '{one.name}' changes both the magnet and an instrument; "
                              "give each of them a table of its own")
+        idle = next((name for name in one.change if not _changes_readings(study, name)), None)
+        if idle is not None:
+            raise ValueError(
+                f"uncertain '{one.name}' changes '{idle}', which no update estimates; name numbers "
+                "of the magnet (array, iron, iron_ring, external; demagnetization if it is "
+                "irreversible) or of an instrument" + (
+                    ": gain, or z_scale and radius_scale, in place of a unit"
+                    if "_unit_" in idle else ""))
         for name in one.change:
             if study.maps or not name.startswith("maps["):  # else it is the study of one of them
                 _check_number(study, name)
+
+
+def _changes_readings(study: Study, name: str) -> bool:
+    """Return whether readings can depend on the number of a name."""
+    losses = study.demagnetization is not None and study.demagnetization.irreversible
+    return bool(OF_READINGS.match(name)) and (losses or not name.startswith("demagnetization."))
 
 
 def _check_number(study: Study, name: str) -> None:

@@ -22,6 +22,7 @@ from halbach_fe.study.types import (
     Gap,
     Length,
     Line,
+    Place,
     Places,
     Point,
     Rotation,
@@ -233,7 +234,7 @@ class IronTube(PlacedIron):
     inner_radius_m: Gap
     outer_radius_m: Length
     length_m: Length | None = None
-    z_m: Coordinate = 0.0
+    z_m: Place = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> IronTube:
@@ -304,7 +305,7 @@ class IronPrism(PlacedIron):
     holes: Annotated[tuple[IronHole, ...], Field(max_length=200)] = ()
     copies: Annotated[int, Field(ge=1, le=512)] = 1
     length_m: Length | None = None
-    z_m: Coordinate = 0.0
+    z_m: Place = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> IronPrism:

@@ -12,11 +12,11 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.types import (
     RISING_PER_K,
     Angle,
-    Coordinate,
     FluxDensityVector,
     Gap,
     Length,
     Moment,
+    Place,
     Places,
     Point,
     ReferenceTemperature,
@@ -38,7 +38,7 @@ class Neighbour(StudyModel):
     other neighbours, and needs a 3D study.
     """
 
-    z_m: Coordinate
+    z_m: Place
     turn_deg: Angle = 0.0
     factor: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
 

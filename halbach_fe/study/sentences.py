@@ -148,7 +148,8 @@ def hint(key: str, error: ErrorDetails) -> str:
     if kind != "tuple_type":
         return (wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."
                 if number else "")
-    deviation = wrong_unit(key, value, {"le": most_deviation}) if number else ""
+    large = number and not abs(value) <= most_deviation  # a small one is in the right unit
+    deviation = wrong_unit(key, value, {"le": most_deviation}) if large else ""
     return f"Write it in brackets, an element for each axis or part. {deviation}".strip()
 
 

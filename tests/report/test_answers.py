@@ -368,6 +368,30 @@ def of_sort(given):
                                    f"in 95 % of random orders {low:.3g} to {high:.3g}"]
 
 
+def test_sort_says_whether_its_limit_is_met(given):
+    """An answer without a word of it said "Yes" of magnets 30 times beyond; a wide one is met."""
+    found = hf.sort(given.magnet, given.campaign.blocks, given.session)
+    assert "with a probability" not in sorting.answer(found).said  # without a limit
+    largest = found.best.sizes.max()
+    narrow, wide = (sorting.answer(replace(found, limit=float(part * largest))).said
+                    for part in (0.5, 10.0))
+    assert "probability of less than 0.1\u00a0%. Sorting does not reach that limit." in narrow
+    assert "with a probability of more than 99.9\u00a0%." in wide
+    assert "reach" not in wide
+    content = sorting.page(replace(found, limit=float(10 * largest))).summary
+    assert content["probability_within_limit"] == 1.0
+
+
+def test_sort_of_blocks_that_are_alike_says_that_they_are(given):
+    """The slots of a type may all take the same blocks: not only those at one angle may change."""
+    found = hf.sort(given.magnet, given.campaign.blocks, given.session)
+    found = replace(found, random=np.full(len(found.random), found.best.rms_of_mean))
+    said = sorting.answer(found)
+    assert said.said.startswith("It does not matter")
+    assert "alike as measured" in said.trust
+    assert "at the same angle" not in said.trust
+
+
 @pytest.mark.filterwarnings("ignore:Every block of study")
 @pytest.mark.parametrize(("rings", "types", "said"), [
     (2, {"a": list(range(1, 9))}, "random orders"), (2, None, "It does not matter"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -75,6 +76,21 @@ def test_noise_that_is_stated_too_large_is_no_disagreement(campaign, session):
     assert said.said.startswith("Model and measurement agree better than the stated noise allows")
     assert "halbach-fe check" in said.command
     assert not said.sound
+
+
+def test_few_readings_are_near_the_model_by_chance(campaign, session):
+    """A single reading was said to have too much noise in a quarter of all maps: chi-squared of one
+    degree of freedom is below a tenth with that probability. Control: far nearer than chance.
+    """
+    result, _ = answered(campaign, session)
+    few = np.ones(len(result.held_out), bool)
+    for readings, chi2, said in ((1, 0.02, False), (3, 0.05, False), (3, 1e-6, True),
+                                 (9, 1e-3, True), (200, 0.09, True)):
+        held_out = few.copy()
+        held_out[:readings] = False
+        one = replace(result, prior_conflict=chi2)
+        vars(one).update(held_out=held_out, noise_ratio=np.nan)  # the other measure of the noise
+        assert bool(one.too_near) == said
 
 
 def test_the_table_has_the_chi2_of_the_answer(campaign, session):

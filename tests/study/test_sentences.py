@@ -128,6 +128,15 @@ def test_sentences_are_ours(changes, said):
         assert sentence.partition("must be ")[2][:20] in str(caught.value)
 
 
+@pytest.mark.parametrize("changes", [
+    {"gain": 0.01}, {"translation_m": 0.002}, {"sensor_position_m": [0.001, 0.0, 0.0]}])
+def test_a_number_for_a_list_is_not_said_to_be_in_another_unit(changes):
+    """Of a gain of 0.01 per cent were asked for, "then write 0.0001"."""
+    with pytest.raises(StudyError, match="an element for each axis or part") as caught:
+        parse_study(changed(DIPOLE, instrument=changes))
+    assert "Was it meant" not in str(caught.value)
+
+
 @pytest.mark.parametrize(("changes", "said"), [
     ({"array": {"remanence_T": 1.2}}, "instead received nothing. Add the keys. `array={...}` is "
      "a whole new table; `array__KEY=...` changes one of its keys."),

@@ -453,6 +453,34 @@ def test_blocks_of_tons_are_asked_about(tmp_path, outer, asked):
         read_study(path)
 
 
+SHORT = changed(DIPOLE, dimension=3, array__ring_length_m=0.05, array__rings=2)
+TUBE = {"kind": "tube", "inner_radius_m": 1.0, "outer_radius_m": 1.2, "length_m": 0.01}
+
+
+@pytest.mark.parametrize(("changes", "far"), [
+    ({"array__ring_gap_m": 9.0}, 9.0), ({"array__ring_gap_m": 0.1}, None),
+    ({"array__ring": [{"z_m": -6.0}, {"z_m": 6.0}]}, 11.95),
+    ({"external": {"neighbours": [{"z_m": 9.95}]}}, 9.85),
+    ({"external": {"neighbours": [{"z_m": 0.5}]}}, None),
+    ({"iron": {"relative_permeability": 100.0, "bodies": [TUBE | {"z_m": 0.1}]}}, None)])
+def test_sources_far_from_each_other_along_z_are_asked_about(changes, far):
+    """The field was zero without a word; iron 60 m away was meshed for minutes before any."""
+    study = parse_study(changed(SHORT, **changes))
+    said = f"leave {far:.3g} m between each other along z" if far else ""
+    with pytest.warns(HalbachWarning, match=said) if far else contextlib.nullcontext():
+        build_magnet(study)
+
+
+@pytest.mark.parametrize("changes", [
+    {"array__ring": [{"z_m": -12.0}, {"z_m": 12.0}]}, {"external": {"neighbours": [{"z_m": 80.0}]}},
+    {"iron": {"relative_permeability": 100.0, "bodies": [TUBE | {"z_m": 60.0}]}},
+    {"shim_tray": {"rings": [{"radius_m": 0.03, "count": 4, "z_m": [20.0]}], "magnets": [
+        {"name": "c", "size_m": [0.003] * 3, "remanence_T": 1.2, "count": 4}]}}])
+def test_places_along_z_in_mm_are_refused(changes):
+    with pytest.raises(StudyError, match="Was it meant in millimetres"):
+        parse_study(changed(SHORT, **changes))
+
+
 @pytest.mark.parametrize(("keys", "asked"), [
     ("background_T = [0, 0.5, 0]", r"500 mT, 10000 times the earth's field.* 1 G is 1e-4 T"),
     ("background_T = [0.03, 0.03, 0.03]", "52 mT, "), ("background_T = [0, 5e-5, 1e-3]", ""),
@@ -496,3 +524,24 @@ def test_what_is_uncertain_of_the_instrument_of_a_map(dipole):
         first, second = study.of_map(number).uncertain
         assert first.change == {"instrument.z_scale": change}
         assert second == study.uncertain[1]
+
+
+@pytest.mark.parametrize("name", [
+    "prior.magnitude_sd", "mesh.block_size_m", "noise.regions[1].sigma_T",
+    "observation.positions.end_m[1]", "instrument.length_unit_m", "instrument.flux_density_unit_T",
+    "demagnetization.squareness", "maps[1].noise.regions[1].sigma_T"])
+def test_what_no_update_estimates_is_not_uncertain(dipole, name):
+    """Such tables were taken, and the bars stayed those without them: of a unit 1 % off, too."""
+    material = {"intrinsic_coercivity_A_per_m": 955e3, "remanence_coefficient_per_K": -0.0012,
+                "coercivity_coefficient_per_K": -0.006}
+    noise = {"regions": [{"name": "all", "sigma_T": 1e-5}]}
+
+    def study(key):
+        return dipole(demagnetization=material, noise=noise, maps=[
+            {"name": "body", "file": "a.csv", "noise": noise, "instrument": {"z_scale": 0.01}}],
+            uncertain=[{"name": "u", "sd": 1e-3, "change": {key: 1.0}}])
+
+    with pytest.raises(StudyError, match="which no update estimates"):
+        study(name)
+    for known in ("instrument.z_scale", "maps[1].instrument.z_scale", "array.remanence_T"):
+        assert study(known).uncertain
