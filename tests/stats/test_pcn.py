@@ -18,7 +18,7 @@ from halbach_fe.stats.pcn import (
     require_convergence,
     sample,
 )
-from halbach_fe.stats.small_samples import ranks, uniformity
+from studies.calibration.truth_ranks import ranks, uniformity
 
 SIZE = 3
 
