@@ -254,7 +254,7 @@ def homogeneity(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     readings. Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and
     its figures.
     """
-    from halbach_fe.response.homogeneity import SHOWN_DEGREES
+    from halbach_fe.response.region import SHOWN_DEGREES
 
     within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
     if not arguments.measurements and describes_a_format(arguments):

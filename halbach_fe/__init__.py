@@ -85,9 +85,9 @@ if TYPE_CHECKING:
     from halbach_fe.response.discretization_error import verify as verify
     from halbach_fe.response.field_on_lines import FieldOnLines as FieldOnLines
     from halbach_fe.response.field_on_lines import Lines as Lines
-    from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
+    from halbach_fe.response.region import Region as Region
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
     from halbach_fe.response.stray_field import StrayField as StrayField
@@ -127,7 +127,7 @@ _HOME = {
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
     "Verification": "response.discretization_error",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
-    "Region": "response.homogeneity", "HomogeneityResult": "api",
+    "Region": "response.region", "HomogeneityResult": "api",
     "Forces": "design.forces",
     "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
     "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",

@@ -41,8 +41,9 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import study_prior
-from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
+from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.region import Region, default_region, region_points
 from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian

@@ -31,8 +31,7 @@ from scipy.linalg import block_diag, solve_triangular
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
-from halbach_fe.geometry.blocks import present_blocks
-from halbach_fe.geometry.cells import distance_from_blocks
+from halbach_fe.geometry.blocks import distance_from_blocks, present_blocks
 from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns
@@ -50,7 +49,8 @@ from halbach_fe.measurement.harmonic_field import (
     fit_readings,
     solid_harmonic_fields,
 )
-from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel, sphere_points
+from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel
+from halbach_fe.response.region import sphere_points
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

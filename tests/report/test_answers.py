@@ -55,8 +55,8 @@ from halbach_fe.report.words import (
     share_in_words,
     with_error,
 )
-from halbach_fe.response.homogeneity import Region
 from halbach_fe.response.multipoles import MultipoleReference, Multipoles
+from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
