@@ -161,12 +161,8 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_complete(magnet, table, used)
-    index = _block_of_rows(magnet, table)
-    conversion = _conversions(magnet, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
+    index, conversion, measured, deviations = _measured(magnet, table)
     frames = np.array([_frame(block) for block in blocks])
-    deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
-    _check_near(table, deviations)
     deviations, frames = deviations[:, :size], frames[:, :size, :size]
     placed = bool(table.ring.any())
     members = {label: deviations[np.array(table.type) == label]
@@ -331,20 +327,28 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     StudyError
         If the study's blocks of a type differ from each other.
     """
-    magnet = as_meant(magnet)
-    blocks, size = magnet.blocks, magnet.dimension
+    magnet, size = as_meant(magnet), magnet.dimension
     table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_alike(magnet, lambda block: block.shape_axes, "Name them as types of their own.",
                  OF_OTHER_RINGS if magnet.array.rings else OF_FREE_BLOCKS)
-    index = _block_of_rows(magnet, table)
-    conversion = _conversions(magnet, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
-    frames = np.array([_frame(block) for block in blocks])[index]
-    _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([blocks[i].shape_axes.T for i in index])
+    index, conversion, measured, _ = _measured(magnet, table)
+    own = np.array([magnet.blocks[i].shape_axes.T for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
+
+
+def _measured(magnet: Magnet, table: BlockTable) -> tuple[Ints, Floats, Floats, Floats]:
+    """Return the blocks (rows,) of a table, the factors (rows, 3, 3) of their moments, and their
+    magnetizations (rows, 3) in A/m, also relative to nominal in the axes of `_frame`.
+    """
+    index = _block_of_rows(magnet, table)
+    conversion = _conversions(magnet, table, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
+    frames = np.array([_frame(block) for block in magnet.blocks])[index]
+    deviations = np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0]
+    _check_near(table, deviations)
+    return index, conversion, measured, deviations
 
 
 def as_mounted(
@@ -441,9 +445,7 @@ def _of_block(block: MagnetBlock, tensor: Floats) -> Floats:
     return np.asarray(np.linalg.solve(mu, inside))
 
 
-def _conversions(
-    magnet: Magnet, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
-) -> Floats:
+def _conversions(magnet: Magnet, table: BlockTable, index: Ints) -> Floats:
     """Return the matrices (rows, 3, 3) from measured moments in A m^2 to M in A/m.
 
     M is along the array's axes. A block of the study gets the measured moment, which is what its
@@ -454,7 +456,7 @@ def _conversions(
     # Largest deviation of a measured volume from that of the study's block, relative to the latter.
     # The chamfers and tolerances of blocks change it by less.
     volume_tolerance = 0.1
-    flat = magnet.dimension == 2
+    blocks, flat = magnet.blocks, magnet.dimension == 2
     length = magnet.array.ring_length_m
     if flat and not length:
         unknown = np.flatnonzero(np.isnan(table.volume))
