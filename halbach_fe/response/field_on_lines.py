@@ -501,11 +501,8 @@ def _through_blocks(
         return _through_cross_section(magnet, points, number, magnetizations, session)
     solved = None if magnet.is_vacuum else solve_separate(magnet, session)
     nominal, weak = _nominal_strength(magnet, points, number, solved)
-    tensors = np.array([block.recoil_tensor for block in blocks])
-    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
-                              magnetizations.root]).reshape(len(blocks), 3, -1)
-    remanence = MU_0 * tensors @ change
-    strength = np.zeros((*points.shape, change.shape[2]))
+    tensors, remanence = _remanence(magnet, magnetizations)
+    strength = np.zeros((*points.shape, remanence.shape[2]))
     for block, field in enumerate(unit_fields(blocks, points[~in_iron])):
         strength[~in_iron] += field @ remanence[block]
     if solved is not None and solved.iron is not None:
@@ -560,6 +557,16 @@ def _nominal_strength(
     return strength, error
 
 
+def _remanence(magnet: Magnet, magnetizations: Gaussian) -> tuple[Floats, Floats]:
+    """Return the recoil tensors (blocks, 3, 3), and the remanences (blocks, 3, 1 + q) in T by which
+    mean and root differ from the nominal magnet.
+    """
+    tensors = np.array([block.recoil_tensor for block in magnet.blocks])
+    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
+                              magnetizations.root]).reshape(len(tensors), magnet.dimension, -1)
+    return tensors, MU_0 * tensors[:, :, :magnet.dimension] @ change
+
+
 def _through_cross_section(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
     session: Session,
@@ -570,11 +577,8 @@ def _through_cross_section(
     parts = finite_element_part(magnet, points, session, anywhere=True)
     error = reading_errors(magnet, flux_density_at(points), parts,
                            session).reshape(-1, 3)
-    tensors = np.array([block.recoil_tensor for block in blocks])
-    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
-                              magnetizations.root]).reshape(len(blocks), 2, -1)
-    remanence = MU_0 * tensors[:, :, :2] @ change
-    flux = np.zeros((*points.shape, change.shape[2]))
+    tensors, remanence = _remanence(magnet, magnetizations)
+    flux = np.zeros((*points.shape, remanence.shape[2]))
     for block, unit in enumerate(unit_fields(blocks, points)):
         flux += (unit[..., :2] + parts.block(block, slice(None))) @ remanence[block, :2]
     flux[..., 0] += external_field(magnet, points) + field_of(blocks, points) + parts.nominal
