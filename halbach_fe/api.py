@@ -509,7 +509,8 @@ def field(
                       f"that makes {100 * spacing:.2g} % of the integral of |B|, which is in "
                       "their error bars. Take more points (--count), or shorter lines.",
                       HalbachWarning, stacklevel=2)
-    return found
+    return replace(found, measured=posterior is not None,
+                   disagreement=disagreement_of(posterior, magnet))
 
 
 @alone

@@ -32,6 +32,7 @@ from halbach_fe.report import (
     campaign,
     demagnetization,
     diagnosis_figures,
+    field,
     forces,
     homogeneity,
     inference_answer,
@@ -443,8 +444,17 @@ def of_infer(given):
         flux_density(float(np.sqrt(np.mean(off**2)))), f"{given.updated.prior_conflict:.3g}"]
 
 
-ANSWERS = (of_solve, of_verify, of_multipoles, of_homogeneity, of_forces, of_plan, of_prior,
-           of_sort, of_shim, of_tolerance, of_demagnetization, of_simulate, of_infer)
+def of_field(given):
+    lines = hf.Lines((0, 0, -0.2), (0, 0, 0.2), count=41)
+    found = hf.field(given.magnet, lines, given.session)
+    first, sd = found.integrals(1)
+    return field.answer(found), [
+        flux_density(float(np.linalg.norm(found.mean, axis=2).max()), 4), "1 line of 41 points",
+        with_error(float(first[0, 0]), float(sd[0, 0])), "as ordered"]
+
+
+ANSWERS = (of_solve, of_verify, of_field, of_multipoles, of_homogeneity, of_forces, of_plan,
+           of_prior, of_sort, of_shim, of_tolerance, of_demagnetization, of_simulate, of_infer)
 
 
 @pytest.mark.parametrize("of", ANSWERS, ids=lambda of: of.__name__)
