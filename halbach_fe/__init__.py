@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from halbach_fe.explanation import explain as explain
     from halbach_fe.geometry.magnet import Magnet as Magnet
     from halbach_fe.geometry.magnet import build_magnet as build_magnet
+    from halbach_fe.inference.block_prior import MeasuredPrior as MeasuredPrior
     from halbach_fe.inference.block_prior import prior_from_blocks as prior_from_blocks
     from halbach_fe.inference.infer import infer as infer
     from halbach_fe.inference.pose_result import Registration as Registration
@@ -104,7 +105,7 @@ _HOME = {
     "field_map": "measurement.field_map", "write_map": "measurement.field_map",
     **dict.fromkeys(("import_map", "import_blocks", "export", "prior", "field"), "api"),
     "register": "inference.registration", "Registration": "inference.pose_result",
-    "prior_from_blocks": "inference.block_prior",
+    "prior_from_blocks": "inference.block_prior", "MeasuredPrior": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
     "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
     "read_blocks": "measurement.block_table",

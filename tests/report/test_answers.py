@@ -649,7 +649,7 @@ def test_the_parts_of_a_deviation_add_up(given):
     """By squares, to what the answer says; an angle in degrees is a part of the length."""
     found = prior_from_blocks(given.magnet, given.campaign.blocks)
     assert len(found.nominal) == 3 * len(given.magnet.blocks)
-    for row, size in zip(prior.parts_table(given.magnet, found), (
+    for row, size in zip(prior.parts_table(found), (
             found.gaussian.mean - found.nominal, found.gaussian.sd), strict=True):
         _, length, *angles, together = row.values()
         assert len(angles) == 2
