@@ -24,7 +24,8 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.homogeneity import PPM, Region, homogeneity_model, real_harmonics
+from halbach_fe.response.homogeneity import PPM, homogeneity_model, real_harmonics
+from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study

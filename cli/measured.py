@@ -273,17 +273,13 @@ def _run_campaign(
 
 @question(STUDY, OUTPUT, option("blocks", input_file, "BLOCKS", "table of measured blocks (CSV)"),
           JSON)
-def prior(magnet: hf.Magnet, arguments: argparse.Namespace) -> Page:
+def prior(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Turn moments of single blocks, measured in a Helmholtz coil, into a prior.
 
     Writes prior.h5 (mean and covariance), prior.json, prior.html and its figure. `halbach-fe infer
     --blocks` uses the same prior directly.
     """
-    from halbach_fe.report.prior import page
-
-    table = hf.read_blocks(arguments.blocks)
-    common.own_folder(arguments, magnet.study.name)
-    return page(magnet, hf.prior_from_blocks(magnet, table))
+    return hf.prior(magnet, hf.read_blocks(arguments.blocks))
 
 
 @question(

@@ -6,7 +6,6 @@ import argparse
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import halbach_fe as hf
 from halbach_fe.cli import common
@@ -40,9 +39,6 @@ from halbach_fe.cli.options import (
 )
 from halbach_fe.core.errors import CommandLineError, StudyError, must_be
 from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
-
-if TYPE_CHECKING:
-    from halbach_fe.core.arrays import Floats
 
 
 @question(SOLVED, dry_run)
@@ -124,17 +120,13 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With
     --posterior the bars are those of the measured magnet, otherwise those of the study's prior.
     With --inside points may lie inside blocks and iron. Writes field.csv, field_map.csv (B as a
-    map, which halbach-fe export turns into other formats) and integrals.csv, and for a grid of
-    lines in air kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+    map, which halbach-fe export turns into other formats), integrals.csv, field.html and its
+    figure, and for a grid of lines in air kick_map.txt in the text format of Radia, with kicks in
+    T^2 m^2.
     """
     import numpy as np
 
-    from halbach_fe.core.files import write_text
-    from halbach_fe.core.numbers import csv_text
-    from halbach_fe.inference.storage import disagreement_of
-    from halbach_fe.report.page import columns_by_axis
-    from halbach_fe.report.words import with_error
-    from halbach_fe.study.types import COMPONENTS
+    from halbach_fe.report.page import page_of
 
     fewest = 2  # along a half width
     if arguments.lines and (arguments.lines < fewest or not any(arguments.across_m)):
@@ -142,83 +134,14 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
                                  "the half widths of the grid of lines", f"{arguments.lines}"
                                  + ("" if any(arguments.across_m) else " alone"),
                                  "Correct it, add --across-m U V, or leave it out."))
-    offsets = tuple(np.linspace(-half, half, arguments.lines or 5) if half else np.zeros(1)
-                    for half in arguments.across_m)
+    offsets = [np.linspace(-half, half, arguments.lines or 5) if half else np.zeros(1)
+               for half in arguments.across_m]
     lines = hf.Lines(np.array(arguments.from_m), np.array(arguments.to_m),
                      (offsets[0], offsets[1]), arguments.count)
-    read = common.posterior_of(arguments, magnet)
+    posterior = common.posterior_of(arguments, magnet)
     with common.session(arguments, magnet.study) as session:
-        found = hf.field(magnet, lines, session, read, arguments.inside)
-    folder = arguments.output
-    points: dict[str, Floats] = {}
-    for name, values in (("{}_m", lines.points), ("B{}_T", found.mean), ("sd_B{}_T", found.sd),
-                         *zip(("H{}_A_per_m", "sd_H{}_A_per_m"), found.strength, strict=True)):
-        points |= columns_by_axis(name, values)
-    write_text(folder / "field.csv", csv_text({**points, "in_block": found.in_block.ravel()}))
-    hf.write_map(hf.field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
-        "study": magnet.name}), folder / "field_map.csv")
-    columns = _integrals(found, *np.meshgrid(*offsets, indexing="ij"))
-    without = 0
-    if min(map(len, offsets)) > 1:
-        kicks = found.kicks()
-        for across, (kick, sd) in zip("uv", kicks, strict=True):
-            columns |= {f"kick_{across}_T2_m2": kick.ravel(),
-                        f"sd_kick_{across}_T2_m2": sd.ravel()}
-        without = int(np.isnan(kicks[0][0]).sum())
-        if not without:
-            write_text(folder / "kick_map.txt", kick_map(
-                found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
-    write_text(folder / "integrals.csv", csv_text(columns))
-    doubt = disagreement_of(read, magnet)
-    if arguments.json:
-        common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
-                           "reservation": doubt or None, "folder": str(folder),
-                           **{name: [None if np.isnan(value) else float(value) for value in values]
-                              for name, values in columns.items()}})
-        return 0
-    middle = len(columns["u_m"]) // 2
-    common.print_table([{
-        "component": axis, **{
-            f"{name} integral, {unit}": with_error(columns[f"I{order}{axis}_{key}"][middle],
-                                                   columns[f"sd_I{order}{axis}_{key}"][middle])
-            for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
-                                                                         "T_m2"))}}
-        for axis in COMPONENTS], "Integrals of B along the "
-        + ("middle line" if not columns["u_m"][middle] and not columns["v_m"][middle] else
-           f"line at u = {1e3 * columns['u_m'][middle]:.4g} mm, "
-           f"v = {1e3 * columns['v_m'][middle]:.4g} mm"))
-    if doubt:
-        say(doubt)
-    if without:
-        say(f"No kick_map.txt: {without} of {len(lines.points)} lines go through or along blocks "
-            "or iron, where no particle flies, and have no kicks.")
-    several = "1 line" if len(lines.points) == 1 else f"{len(lines.points)} lines"
-    say(f"Wrote {several} of {lines.count} points: {folder}")
-    return 0
-
-
-def _integrals(found: hf.FieldOnLines, u_m: Floats, v_m: Floats) -> dict[str, Floats]:
-    """Return the columns of integrals.csv, a row for each line at the offsets u and v."""
-    columns = {"u_m": u_m.ravel(), "v_m": v_m.ravel()}
-    for order, unit in ((1, "T_m"), (2, "T_m2")):
-        mean, sd = found.integrals(order)
-        for axis, values, bars in zip("xyz", mean.T, sd.T, strict=True):
-            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
-    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
-    return columns
-
-
-def kick_map(length: float, offsets: tuple[Floats, ...], kicks: tuple[Floats, Floats]) -> str:
-    """Return a kick map in the text format of Radia; rows begin at the highest offset."""
-    text = ["# kick map of halbach-fe", "# Length [m]", f"{length:.9g}",
-            "# Number of Horizontal Points", f"{len(offsets[0])}",
-            "# Number of Vertical Points", f"{len(offsets[1])}"]
-    for name, kick in zip(("Horizontal", "Vertical"), kicks, strict=True):
-        text += [f"# {name} 2nd Order Kick [T2m2]", "START",
-                 "\t" + "\t".join(f"{u:.9g}" for u in offsets[0])]
-        text += ["\t".join([f"{offsets[1][row]:.9g}", *(f"{value:.12g}" for value in kick[:, row])])
-                 for row in range(len(offsets[1]) - 1, -1, -1)]
-    return "\n".join(text) + "\n"
+        made = page_of(hf.field(magnet, lines, session, posterior, arguments.inside))
+    return replace(made, summary={**made.summary, "folder": str(arguments.output)})
 
 
 @question(SOLVED, POSTERIOR, MULTIPOLES)
@@ -254,7 +177,7 @@ def homogeneity(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     readings. Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and
     its figures.
     """
-    from halbach_fe.response.homogeneity import SHOWN_DEGREES
+    from halbach_fe.response.region import SHOWN_DEGREES
 
     within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
     if not arguments.measurements and describes_a_format(arguments):

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from halbach_fe.explanation import explain as explain
     from halbach_fe.geometry.magnet import Magnet as Magnet
     from halbach_fe.geometry.magnet import build_magnet as build_magnet
+    from halbach_fe.inference.block_prior import MeasuredPrior as MeasuredPrior
     from halbach_fe.inference.block_prior import prior_from_blocks as prior_from_blocks
     from halbach_fe.inference.infer import infer as infer
     from halbach_fe.inference.pose_result import Registration as Registration
@@ -85,9 +86,9 @@ if TYPE_CHECKING:
     from halbach_fe.response.discretization_error import verify as verify
     from halbach_fe.response.field_on_lines import FieldOnLines as FieldOnLines
     from halbach_fe.response.field_on_lines import Lines as Lines
-    from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
+    from halbach_fe.response.region import Region as Region
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
     from halbach_fe.response.stray_field import StrayField as StrayField
@@ -104,7 +105,7 @@ _HOME = {
     "field_map": "measurement.field_map", "write_map": "measurement.field_map",
     **dict.fromkeys(("import_map", "import_blocks", "export", "prior", "field"), "api"),
     "register": "inference.registration", "Registration": "inference.pose_result",
-    "prior_from_blocks": "inference.block_prior",
+    "prior_from_blocks": "inference.block_prior", "MeasuredPrior": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
     "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
     "read_blocks": "measurement.block_table",
@@ -127,7 +128,7 @@ _HOME = {
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
     "Verification": "response.discretization_error",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
-    "Region": "response.homogeneity", "HomogeneityResult": "api",
+    "Region": "response.region", "HomogeneityResult": "api",
     "Forces": "design.forces",
     "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
     "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",

@@ -58,14 +58,7 @@ from halbach_fe.measurement.formats.files import import_map as read_foreign_map
 from halbach_fe.measurement.instrument import check_total_field
 from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.field_on_lines import FieldOnLines, Lines, field_on_lines
-from halbach_fe.response.homogeneity import (
-    SHOWN_DEGREES,
-    Homogeneity,
-    HomogeneityModel,
-    Region,
-    default_region,
-    homogeneity_model,
-)
+from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel, homogeneity_model
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.magnetic_axis import magnetic_axis as axis_of
 from halbach_fe.response.multipoles import (
@@ -74,6 +67,7 @@ from halbach_fe.response.multipoles import (
     Multipoles,
     multipole_models,
 )
+from halbach_fe.response.region import SHOWN_DEGREES, Region, default_region
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
@@ -515,7 +509,8 @@ def field(
                       f"that makes {100 * spacing:.2g} % of the integral of |B|, which is in "
                       "their error bars. Take more points (--count), or shorter lines.",
                       HalbachWarning, stacklevel=2)
-    return found
+    return replace(found, measured=posterior is not None,
+                   disagreement=disagreement_of(posterior, magnet))
 
 
 @alone

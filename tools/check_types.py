@@ -16,7 +16,9 @@ from mypy import build, main
 ROOT = Path(__file__).resolve().parent.parent
 OTHERS = ("benchmarks", "tests")
 """Packages that are not installed. Of the tests only names are followed, see pyproject.toml."""
-SCRIPTS = ("studies/*/*_page.py", "studies/diagnosis/drawn_studies.py", "docs/paper_figures.py")
+SCRIPTS = ("studies/*_page.py", "studies/*/*_page.py", "studies/calibration/truth_ranks.py",
+           "studies/diagnosis/drawn_studies.py", "studies/diagnosis/stated_probabilities.py",
+           "docs/paper_figures.py")
 """Modules that the studies and the documentation import, and tests by these names."""
 
 

@@ -57,7 +57,7 @@ WRITES = {
     "multipoles": ("multipoles.*", "multipoles_*.png"),
     "homogeneity": ("homogeneity.*", "harmonics.csv", "harmonics.png", "stray_field.png"),
     "forces": ("forces.*",), "field": (
-        "field.csv", "field_map.csv", "integrals.csv", "kick_map.txt"),
+        "field.*", "field_map.csv", "integrals.csv", "kick_map.txt"),
     "design": ("design.json", "design.html", "rings.csv", "rings.png", "front.png", "slices.png",
                "study.designed.toml"),
     "cad": ("blocks.step", "blocks.stl", "holder*.step", "holder*.stl", "magnet.step",

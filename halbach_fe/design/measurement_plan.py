@@ -34,15 +34,16 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.infer import neighbour_columns
-from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns, joined
+from halbach_fe.inference.instrument_fit import open_columns
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.measurement.campaign import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import study_prior
-from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
+from halbach_fe.response.block_variation import study_prior, with_variations
+from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.region import Region, default_region, region_points
 from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -160,7 +161,7 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     beside = _beside(magnet, readings, one, field, model.shared_error)
     errors = readings.noise.with_independent_errors(model.error)
     prior = study_prior(magnet, len(model.parameters) - len(magnet.parameter_names))
-    everything = joined(prior, *np.repeat([[0.0], [1.0]], beside.shape[1], axis=1))
+    everything = with_variations(prior, beside.shape[1])
     whole = np.hstack([model.whole, beside])
     size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(whole @ everything.root).reshape(len(points), size, -1)
@@ -239,14 +240,10 @@ def _beside(
     """Return readings (n, k) in T per prior standard deviation of what is open beside the
     parameters of the magnet; ``shared_error`` (e, n) in T is the solver's.
     """
-    terms = OpenTerms.of([one])
-    found = [shared_error.reshape(-1, len(readings.values)).T,
-             neighbour_columns(magnet, [one], readings)]
-    if len(terms):
-        found.append(terms.columns(field, [one], readings) * terms.sd)
-    if any(each.is_of_instrument for each in one.study.uncertain):
-        found.append(amplitude_columns(one.study, field, [one], readings))
-    return np.hstack(found)
+    return np.hstack([
+        shared_error.reshape(-1, len(readings.values)).T,
+        neighbour_columns(magnet, [one], readings),
+        open_columns(one.study, field, [one], readings)])
 
 
 def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:

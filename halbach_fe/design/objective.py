@@ -24,13 +24,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import LIMIT_PPM, LIMIT_UNITS, check_number
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.homogeneity import (
-    PPM,
-    HomogeneityModel,
-    default_region,
-    homogeneity_model,
-    region_points,
-)
+from halbach_fe.response.homogeneity import PPM, HomogeneityModel, homogeneity_model
 from halbach_fe.response.multipoles import (
     MultipoleModel,
     MultipoleReference,
@@ -38,6 +32,7 @@ from halbach_fe.response.multipoles import (
     multipole_model,
     unwanted_orders,
 )
+from halbach_fe.response.region import default_region, region_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
 

@@ -14,7 +14,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.overlaps import overlapping_blocks
-from halbach_fe.response.homogeneity import Region
+from halbach_fe.response.region import Region
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.array import Array, Ring
 from halbach_fe.study.design import Design, DesignLayer

@@ -24,16 +24,8 @@ from halbach_fe.design.forces import DENSITY_KG_PER_M3
 from halbach_fe.design.ring_catalogue import Catalogue, Option, design_of, designed, tables_of
 from halbach_fe.design.ring_search import MISSES, Found, Task, moved_radii, search
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.response.homogeneity import (
-    PPM,
-    Region,
-    Slice,
-    default_region,
-    extremes,
-    region_points,
-    slice_points,
-    slices_of,
-)
+from halbach_fe.response.homogeneity import PPM, Slice, extremes, slice_points, slices_of
+from halbach_fe.response.region import Region, default_region, region_points
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone

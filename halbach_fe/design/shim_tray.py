@@ -31,14 +31,8 @@ from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import distributions_of
 from halbach_fe.response.block_variation import distribution_of, with_variations
-from halbach_fe.response.homogeneity import (
-    PPM,
-    Homogeneity,
-    HomogeneityModel,
-    Region,
-    default_region,
-    homogeneity_model,
-)
+from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, homogeneity_model
+from halbach_fe.response.region import Region, default_region
 from halbach_fe.solver.exact_block_field import unit_field
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian

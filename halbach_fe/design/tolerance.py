@@ -18,7 +18,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import with_others
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
-from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
+from halbach_fe.response.multipoles import MultipoleModel, Multipoles
 from halbach_fe.stats.gaussian import (
     Gaussian,
     block_diagonal_root,
@@ -32,8 +32,36 @@ QUANTILES = (0.05, 0.5, 0.95, 0.99)
 """Probabilities of the quantiles that are reported."""
 
 
+class DrawnMagnets(ShownInNotebook):
+    """What the tolerances of blocks make of magnets that are drawn from a prior."""
+
+    limit: float | None
+
+    @property
+    def largest(self) -> Floats:
+        """What the limit is of, of each magnet (draws,)."""
+        raise NotImplementedError
+
+    @property
+    def share(self) -> float | None:
+        """Share of magnets within the limit; None without a limit."""
+        return None if self.limit is None else float(np.mean(self.largest <= self.limit))
+
+    @property
+    def share_sd(self) -> float | None:
+        """Standard error of `share`, which follows from the number of draws.
+
+        It uses Laplace's rule of succession, so that it is not 0 if the share is 0 or 1.
+        """
+        if self.share is None:
+            return None
+        count = len(self.largest)
+        guess = (self.share * count + 1) / (count + 2)
+        return float(np.sqrt(guess * (1 - guess) / count))
+
+
 @dataclass(frozen=True)
-class Tolerance(ShownInNotebook):
+class Tolerance(DrawnMagnets):
     """Multipoles of magnets whose blocks are drawn from a prior.
 
     Attributes
@@ -53,9 +81,9 @@ class Tolerance(ShownInNotebook):
         Why the table of measured blocks may not be of this magnet; None without a table.
     quantiles : ndarray, shape (len(`QUANTILES`), k)
         Quantiles of |c_n|, in units of 1e-4.
-    share : float or None
-        Share of the magnets, from 0 to 1, whose multipoles are all within the limit; None without
-        a limit.
+    share, share_sd : float or None
+        Share of the magnets, from 0 to 1, whose multipoles are all within the limit, and its
+        standard error; None without a limit.
     """
 
     study: Study
@@ -72,14 +100,9 @@ class Tolerance(ShownInNotebook):
         return np.quantile(self.sizes, QUANTILES, axis=0)
 
     @property
-    def share(self) -> float | None:
-        """Share of magnets whose multipoles are all within the limit; None without a limit."""
-        return None if self.limit is None else met(self.sizes, self.limit)
-
-    @property
-    def share_sd(self) -> float | None:
-        """Standard error of `share`, which follows from the number of draws."""
-        return None if self.share is None else _share_sd(self.share, len(self.sizes))
+    def largest(self) -> Floats:
+        """The largest |c_n| of each magnet in units, (draws,)."""
+        return np.asarray(self.sizes.max(axis=1))
 
     @property
     def shares(self) -> Floats | None:
@@ -87,17 +110,8 @@ class Tolerance(ShownInNotebook):
         return None if self.limit is None else np.mean(self.sizes <= self.limit, axis=0)
 
 
-def _share_sd(share: float, count: int) -> float:
-    """Return the standard error of a share of ``count`` draws.
-
-    It uses Laplace's rule of succession, so that it is not 0 if the share is 0 or 1.
-    """
-    guess = (share * count + 1) / (count + 2)
-    return float(np.sqrt(guess * (1 - guess) / count))
-
-
 @dataclass(frozen=True)
-class HomogeneityTolerance(ShownInNotebook):
+class HomogeneityTolerance(DrawnMagnets):
     """Homogeneity of magnets whose blocks are drawn from a prior.
 
     Attributes
@@ -130,14 +144,9 @@ class HomogeneityTolerance(ShownInNotebook):
     table_doubts: tuple[str, ...] | None = None
 
     @property
-    def share(self) -> float | None:
-        """Share of magnets whose rms deviation is within the limit; None without a limit."""
-        return None if self.limit is None else float(np.mean(self.rms_ppm <= self.limit))
-
-    @property
-    def share_sd(self) -> float | None:
-        """Standard error of `share`, which follows from the number of draws."""
-        return None if self.share is None else _share_sd(self.share, len(self.rms_ppm))
+    def largest(self) -> Floats:
+        """The rms deviation of each magnet in ppm, (draws,)."""
+        return self.rms_ppm
 
 
 def assembled_prior(

@@ -24,9 +24,15 @@ from halbach_fe.geometry.outline import (
     outline_area,
     outline_centroid,
     outline_part,
+    points_on,
     ring_radii,
 )
-from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
+from halbach_fe.geometry.surface import (
+    Contact,
+    contact_of_prism,
+    contact_of_tube,
+    distance_from_prism,
+)
 from halbach_fe.study.materials import MU_0
 
 
@@ -315,3 +321,35 @@ def block_in_words(ring: int, slot: int, label: str = "") -> str:
         return f"block {label}"
     return ", ".join(f"{noun} {number}" for noun, number in (("ring", ring), ("slot", slot))
                      if number)
+
+
+def distance_from_blocks(blocks: Sequence[MagnetBlock], points: Floats, far_m: float) -> Floats:
+    """Return the distances (n,) in m of points (n, 3) from the nearest of some blocks.
+
+    They are negative inside, and ``far_m`` where all blocks are farther than that.
+    """
+    found = np.full(len(points), far_m)
+    for block in blocks:
+        corners = points_on(block.outline)
+        if radii := ring_radii(block.outline):
+            corners = radii[1] * np.array([[-1.0, -1.0], [1.0, 1.0]])
+        places = block.to_frame(points)
+        low = np.append(corners.min(axis=0), block.z_min)
+        high = np.append(corners.max(axis=0), block.z_max)
+        # arcs bulge by less than their chords
+        bulge = float(np.linalg.norm(np.ptp(corners, axis=0))) if any(
+            edge.arc for edge in block.outline) else 0.0
+        beyond = np.maximum(np.maximum(low - places, places - high), 0.0)
+        near = np.flatnonzero(np.linalg.norm(beyond, axis=1) - bulge < found)
+        if not len(near):
+            continue
+        if radii := ring_radii(block.outline):
+            radius = np.hypot(*places[near, :2].T)
+            across = np.maximum(radii[0] - radius, radius - radii[1])
+            along = np.maximum(block.z_min - places[near, 2], places[near, 2] - block.z_max)
+            own = np.hypot(*np.maximum([across, along], 0.0))
+            own = np.where(own > 0, own, np.maximum(across, along))
+        else:
+            own = distance_from_prism(block.outline, block.z_min, block.z_max, places[near])
+        found[near] = np.minimum(found[near], own)
+    return found

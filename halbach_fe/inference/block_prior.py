@@ -25,8 +25,9 @@ import numpy as np
 from scipy.stats import poisson
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
@@ -81,20 +82,35 @@ class TypeSamples:
 
 
 @dataclass(frozen=True)
-class MeasuredPrior:
-    """The prior of a study's magnetizations that follows from a table of measured blocks."""
+class MeasuredPrior(ShownInNotebook):
+    """The prior of a magnet's magnetizations that follows from a table of measured blocks.
 
+    Attributes
+    ----------
+    magnet : Magnet
+    gaussian : Gaussian
+        Prior of the parameters, block by block, in A/m.
+    placed : bool
+        Whether the prior of a block is its own measurement, not the distribution of its type.
+    types : tuple of TypeSamples
+        The measured blocks of every type.
+    doubts : tuple of str
+        Sentences about why the table and the study may not be of the same blocks.
+    far : str
+        A sentence that names single blocks far from the others; empty if there are none.
+    """
+
+    magnet: Magnet
     gaussian: Gaussian
-    """Prior of the parameters, block by block, in A/m."""
-    nominal: Floats
-    """Nominal magnetization. Shape (parameters,), in A/m."""
     placed: bool
-    """Whether the prior of a block is its own measurement, not the distribution of its type."""
     types: tuple[TypeSamples, ...]
     doubts: tuple[str, ...] = ()
-    """Sentences about why the table and the study may not be of the same blocks."""
     far: str = ""
-    """A sentence that names single blocks far from the others; empty if there are none."""
+
+    @property
+    def nominal(self) -> Floats:
+        """Nominal magnetization (parameters,) in A/m."""
+        return self.magnet.nominal_magnetization
 
     @property
     def count(self) -> int:
@@ -145,8 +161,7 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     turns = np.array([matrix * bool(block.remanence) for (_, matrix), block in zip(
         moves, magnet.blocks, strict=True)])[:, :size, :size]
     mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
-    nominal = np.concatenate([block.magnetization[:size] for block in magnet.blocks])
-    return replace(meant, nominal=nominal, gaussian=Gaussian(
+    return replace(meant, magnet=magnet, gaussian=Gaussian(
         (turns @ mean).ravel(), remounted_root(meant.gaussian.root, turns, sources)))
 
 
@@ -161,12 +176,8 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_complete(magnet, table, used)
-    index = _block_of_rows(magnet, table)
-    conversion = _conversions(magnet, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
+    index, conversion, measured, deviations = _measured(magnet, table)
     frames = np.array([_frame(block) for block in blocks])
-    deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
-    _check_near(table, deviations)
     deviations, frames = deviations[:, :size], frames[:, :size, :size]
     placed = bool(table.ring.any())
     members = {label: deviations[np.array(table.type) == label]
@@ -203,14 +214,13 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
             f"The measured blocks of type {', '.join(odd)} do not look normally distributed "
             f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior assumes that they "
             "are: give ring and slot of every block.", HalbachWarning, stacklevel=2)
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     doubts = (*_temperature_doubts(magnet, table), *_mean_doubts(magnet, members),
-              *(_noise_doubts(magnet, gaussian, nominal) if placed else ()))
+              *(_noise_doubts(magnet, gaussian) if placed else ()))
     far = _far_blocks(magnet, table, deviations)
     for said in (*doubts, far):
         if said:
             warnings.warn(said, HalbachWarning, stacklevel=2)
-    return MeasuredPrior(gaussian, nominal, placed, types, doubts, far)
+    return MeasuredPrior(magnet, gaussian, placed, types, doubts, far)
 
 
 def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
@@ -288,7 +298,7 @@ def _mean_doubts(magnet: Magnet, members: dict[str, Floats]) -> list[str]:
             "of this magnet?"]
 
 
-def _noise_doubts(magnet: Magnet, gaussian: Gaussian, nominal: Floats) -> list[str]:
+def _noise_doubts(magnet: Magnet, gaussian: Gaussian) -> list[str]:
     """Return a sentence if the table leaves the blocks less known than the study without it, or
     better than any coil measures.
 
@@ -298,7 +308,7 @@ def _noise_doubts(magnet: Magnet, gaussian: Gaussian, nominal: Floats) -> list[s
     own, across = magnet.study.prior, magnet.dimension - 1
     stated = float(np.linalg.norm((own.magnitude_sd, own.common_mode_sd,
                                    *across * (np.radians(own.direction_sd_deg),))))
-    known = float(np.sqrt(np.square(gaussian.sd).sum() / np.square(nominal).sum()))
+    known = rms(gaussian.sd) / rms(magnet.nominal_magnetization)
     best = 1e-5  # of a moment: good coils repeat within some 1e-4, and are calibrated less well
     if known < best:
         return [f"With this table each block is known to {1e6 * known:.2g} ppm, better than any "
@@ -331,20 +341,28 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     StudyError
         If the study's blocks of a type differ from each other.
     """
-    magnet = as_meant(magnet)
-    blocks, size = magnet.blocks, magnet.dimension
+    magnet, size = as_meant(magnet), magnet.dimension
     table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_alike(magnet, lambda block: block.shape_axes, "Name them as types of their own.",
                  OF_OTHER_RINGS if magnet.array.rings else OF_FREE_BLOCKS)
-    index = _block_of_rows(magnet, table)
-    conversion = _conversions(magnet, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
-    frames = np.array([_frame(block) for block in blocks])[index]
-    _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([blocks[i].shape_axes.T for i in index])
+    index, conversion, measured, _ = _measured(magnet, table)
+    own = np.array([magnet.blocks[i].shape_axes.T for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
+
+
+def _measured(magnet: Magnet, table: BlockTable) -> tuple[Ints, Floats, Floats, Floats]:
+    """Return the blocks (rows,) of a table, the factors (rows, 3, 3) of their moments, and their
+    magnetizations (rows, 3) in A/m, also relative to nominal in the axes of `_frame`.
+    """
+    index = _block_of_rows(magnet, table)
+    conversion = _conversions(magnet, table, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
+    frames = np.array([_frame(block) for block in magnet.blocks])[index]
+    deviations = np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0]
+    _check_near(table, deviations)
+    return index, conversion, measured, deviations
 
 
 def as_mounted(
@@ -441,9 +459,7 @@ def _of_block(block: MagnetBlock, tensor: Floats) -> Floats:
     return np.asarray(np.linalg.solve(mu, inside))
 
 
-def _conversions(
-    magnet: Magnet, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
-) -> Floats:
+def _conversions(magnet: Magnet, table: BlockTable, index: Ints) -> Floats:
     """Return the matrices (rows, 3, 3) from measured moments in A m^2 to M in A/m.
 
     M is along the array's axes. A block of the study gets the measured moment, which is what its
@@ -454,7 +470,7 @@ def _conversions(
     # Largest deviation of a measured volume from that of the study's block, relative to the latter.
     # The chamfers and tolerances of blocks change it by less.
     volume_tolerance = 0.1
-    flat = magnet.dimension == 2
+    blocks, flat = magnet.blocks, magnet.dimension == 2
     length = magnet.array.ring_length_m
     if flat and not length:
         unknown = np.flatnonzero(np.isnan(table.volume))

@@ -22,7 +22,6 @@ from halbach_fe.inference.instrument_fit import (
     OpenTerms,
     amplitude_columns,
     bent,
-    joined,
     of_the_first,
     readings_of_field,
     warn_of_bent_readings,
@@ -66,7 +65,7 @@ from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, with_independent
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
@@ -348,7 +347,7 @@ class _Search:
         matrix: Rows = model.matrix
         exact, of_field, prior = matrix, matrix, self._prior_of_blocks(len(model.parameters))
         for of, columns, mean, sd in self._beside(readings):
-            matrix, prior = Beside(matrix, columns), joined(prior, mean, sd)
+            matrix, prior = Beside(matrix, columns), with_independent(prior, mean, sd)
             exact = Beside(exact, 0 * columns if of == "solver" else columns)
             of_field = Beside(of_field, 0 * columns if of == "instrument" else columns)
         magnitudes = self.magnitudes.about(readings, vectors, model, prior)

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -50,13 +49,7 @@ from halbach_fe.measurement.instrument import (
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import STEP
 from halbach_fe.response.matrix import Response
-from halbach_fe.stats.gaussian import (
-    CovarianceFactor,
-    Gaussian,
-    NoiseCovariance,
-    root_matrix,
-    stacked_root,
-)
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, NoiseCovariance, root_matrix
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.inference import shifted
 from halbach_fe.study.measurement import Instrument
@@ -207,6 +200,20 @@ def _of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
     return found, sd
 
 
+def open_columns(
+    study: Study, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
+) -> Floats:
+    """Return the readings (n, terms) in T per prior standard deviation of all that is open about
+    the instruments: their terms, then amplitudes of the study; see `amplitude_columns`.
+    """
+    terms, found = OpenTerms.of(maps), [np.zeros((len(readings.values), 0))]
+    if len(terms):
+        found.append(terms.columns(field, maps, readings) * terms.sd)
+    if any(one.is_of_instrument for one in study.uncertain):
+        found.append(amplitude_columns(study, field, maps, readings))
+    return np.hstack(found)
+
+
 def amplitude_columns(
     study: Study, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
 ) -> Floats:
@@ -294,13 +301,6 @@ class Beside:
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Floats:
         return np.hstack([self.matrix[rows], self.columns[rows]])
-
-
-def joined(magnet_prior: Gaussian, mean: Floats, sd: Floats) -> Gaussian:
-    """Return the prior of magnetizations and of terms of instruments, which are independent."""
-    root = sparse.block_diag([sparse.csr_array(root_matrix(magnet_prior.root)),
-                              sparse.diags_array(sd)])
-    return Gaussian(np.concatenate([magnet_prior.mean, mean]), stacked_root(root))
 
 
 def of_the_first(distributions: Sequence[Gaussian], count: int) -> list[Gaussian]:

@@ -19,7 +19,7 @@ than it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,11 +31,10 @@ from scipy.linalg import block_diag, solve_triangular
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
-from halbach_fe.geometry.blocks import present_blocks
-from halbach_fe.geometry.cells import distance_from_blocks
+from halbach_fe.geometry.blocks import distance_from_blocks, present_blocks
 from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
-from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns
+from halbach_fe.inference.instrument_fit import open_columns
 from halbach_fe.inference.readings import (
     Readings,
     read_campaign,
@@ -50,7 +49,8 @@ from halbach_fe.measurement.harmonic_field import (
     fit_readings,
     solid_harmonic_fields,
 )
-from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel, sphere_points
+from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel
+from halbach_fe.response.region import sphere_points
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
@@ -207,8 +207,9 @@ def _fitted(
         (observation.points[seen] - centre) / free_m)) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
-    terms = _terms(study, readings, maps, lambda at: (
-        _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
+    terms = open_columns(study, lambda at: (
+        _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3), maps, readings)[
+            used] / sd[:, None]
     mean, noise, root = _with_terms(design, terms, scaled, fit)
     normals = np.random.default_rng(0).standard_normal((root.shape[1], DRAWS))
     every = np.column_stack([mean, mean[:, None] + root @ normals])
@@ -286,20 +287,6 @@ def _open(drawn: Floats, direction: Floats, weights: Floats) -> float:
     along = np.einsum("ncd,c->nd", drawn, direction)
     deviation = along - weights @ along
     return float(np.sqrt(weights @ np.var(deviation, axis=1)))
-
-
-def _terms(
-    study: Study, readings: Readings, maps: Sequence[Map], field: Callable[[Floats], Floats]
-) -> Floats:
-    """Return the readings (n, terms) in T per prior sd of what is open about the instruments: their
-    terms, and amplitudes of the study.
-    """
-    opened, found = OpenTerms.of(maps), [np.zeros((len(readings.values), 0))]
-    if len(opened):
-        found.append(opened.columns(field, maps, readings) * opened.sd)
-    if any(one.is_of_instrument for one in study.uncertain):
-        found.append(amplitude_columns(study, field, maps, readings))
-    return np.hstack(found)
 
 
 def _with_terms(

@@ -6,7 +6,7 @@ of them, with error bars, and the predictions are compared with the readings reg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -148,32 +148,36 @@ class MapPose:
 
 
 @dataclass(frozen=True)
-class InstrumentTerms:
-    """Terms of the instruments that were estimated together with the magnetizations."""
+class Amplitudes:
+    """Uncertain numbers that were estimated together with the magnetizations."""
 
     names: tuple[str, ...]
-    """Such as ``fringe.translation_x_m``, after the name of a map, a stage or a probe."""
+    """As in the tables ``[[uncertain]]`` of the study, those of the magnet first; of instruments
+    such as ``fringe.translation_x_m``, after the name of a map, a stage or a probe."""
     change: Floats
     sd: Floats
     prior_sd: Floats
-    """Change from what the study says, and standard deviations after and before. Shape (terms,)."""
+    """Change from what the study says, and standard deviations after and before. Shape (n,)."""
+
+    def rows(self) -> Iterator[tuple[str, float, float, float]]:
+        """Yield name, change, and standard deviations after and before of each."""
+        return zip(self.names, self.change.tolist(), self.sd.tolist(), self.prior_sd.tolist(),
+                   strict=True)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return these by name as plain data for JSON."""
+        return {name: {"change": change, "sd": sd, "prior_sd": prior_sd}
+                for name, change, sd, prior_sd in self.rows()}
+
+
+@dataclass(frozen=True)
+class InstrumentTerms(Amplitudes):
+    """Terms of the instruments that were estimated together with the magnetizations."""
+
     at_rest: bool
     """Whether the last update changed no term by more than a part of its standard deviation."""
     poses: tuple[MapPose, ...]
     """Where the maps lie whose poses are among the terms."""
-
-
-@dataclass(frozen=True)
-class Amplitudes:
-    """Uncertain amplitudes that were estimated together with the magnetizations."""
-
-    names: tuple[str, ...]
-    """As in the tables ``[[uncertain]]`` of the study: those of the magnet, then of instruments."""
-    change: Floats
-    sd: Floats
-    prior_sd: Floats
-    """Change from what the study says, and standard deviations after and before.
-    Shape (amplitudes,)."""
 
 
 @dataclass(frozen=True)
@@ -598,8 +602,7 @@ class InferenceResult(ShownInNotebook):
         """
         magnet, terms = self.magnet, []
         if self.terms is not None:
-            for name, change, sd in zip(self.terms.names, self.terms.change.tolist(),
-                                        self.terms.prior_sd.tolist(), strict=True):
+            for name, change, _, sd in self.terms.rows():
                 terms.append(Term(*words_of(name.removeprefix(f"{ONLY_MAP}.")), change, sd))
         blocks = block_doubts(magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
         return doubts(terms, magnet.dimension * len(magnet.blocks)) + tuple(

@@ -267,16 +267,8 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
                                  update.contraction.round(6).tolist()],
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
-        "instrument_terms": None if update.terms is None else {
-            name: {"change": float(change), "sd": float(sd), "prior_sd": float(prior_sd)}
-            for name, change, sd, prior_sd in zip(
-                update.terms.names, update.terms.change, update.terms.sd, update.terms.prior_sd,
-                strict=True)},
-        "uncertain": None if update.amplitudes is None else {
-            name: {"change": float(change), "sd": float(sd), "prior_sd": float(prior_sd)}
-            for name, change, sd, prior_sd in zip(
-                update.amplitudes.names, update.amplitudes.change, update.amplitudes.sd,
-                update.amplitudes.prior_sd, strict=True)},
+        "instrument_terms": None if update.terms is None else update.terms.summary(),
+        "uncertain": None if update.amplitudes is None else update.amplitudes.summary(),
         "poses": None if update.terms is None else {
             pose.name: {key: value for key, value in asdict(pose).items() if key != "name"}
             for pose in update.terms.poses},

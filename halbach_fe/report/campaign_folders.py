@@ -32,12 +32,9 @@ from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study, differences, magnet_description
 
-WITHOUT_PAGE = ("halbach-fe field",)
-"""Commands whose results are tables alone, for other programs."""
-
 ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", "plan", "sort",
-         "cad", "simulate-measurement", "check", "register", "prior", "infer", "multipoles",
-         "homogeneity", "diagnose", "shim", "shim-tray")
+         "cad", "simulate-measurement", "check", "register", "prior", "infer", "field",
+         "multipoles", "homogeneity", "diagnose", "shim", "shim-tray")
 """Commands in the order in which data flow; others come last."""
 
 TELLING = {"solve": "field", "diagnose": "diagnosis_profile", "shim": "shim_moves",
@@ -176,10 +173,6 @@ def _chapter(results: Results, label: str) -> Chapter:
             raise refused("results with their page", f"whose {said.page} is none")
         pages.append(Page(str(path), said, _picture(results, path.parent, said)))
     if not pages:
-        if record.command in WITHOUT_PAGE:
-            raise OutputError(must_be("DIR", "the report", "results with a page",
-                                      f"{results.folder}, of `{record.command}`, which writes "
-                                      "tables alone", "Leave it out."))
         raise refused("results with a page", f"which has no {PAGE_RECORD}")
     removed = [f"{name} (removed)" for name in results.removed() if not name.endswith(".png")]
     return Chapter(results.folder, label, record, tuple(pages), (*results.changed(), *removed))
@@ -263,7 +256,7 @@ def is_same_magnet(one: Study, other: Study) -> bool:
 FINDING = ("register", "diagnose")
 """Commands that write a study which later results should be of."""
 
-OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
+OF_MEASURED = ("infer", "field", "multipoles", "homogeneity", "shim", "shim-tray")
 """Commands whose results are of the measured magnet, and should be of such a study."""
 
 UPDATED_BY_MAP = ("infer", "diagnose", "shim", "shim-tray")

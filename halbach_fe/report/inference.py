@@ -86,7 +86,7 @@ def term_table(result: InferenceResult) -> Rows:
     """
     rows = []
     terms = [row for found in (result.terms, result.amplitudes) if found is not None
-             for row in zip(found.names, found.change, found.sd, found.prior_sd, strict=True)]
+             for row in found.rows()]
     changes = {one.name: one.change for one in result.study.uncertain}
     for name, change, sd, prior_sd in terms:
         owner, _, term = name.rpartition(".")

@@ -214,9 +214,11 @@ def last_sections(figures: Figures, model: Mapping[str, str]) -> list[Section]:
 
 PAGES = {
     "Assembly": "assembly", "SimulatedCampaign": "campaign",
-    "DemagnetizationMap": "demagnetization", "Diagnosis": "diagnosis", "Forces": "forces",
+    "DemagnetizationMap": "demagnetization", "Diagnosis": "diagnosis", "FieldOnLines": "field",
+    "Forces": "forces",
     "HomogeneityResult": "homogeneity", "InferenceResult": "inference",
-    "MultipoleTables": "multipoles", "MeasurementPlan": "plan", "Designed": "ring_design",
+    "MultipoleTables": "multipoles", "MeasurementPlan": "plan", "MeasuredPrior": "prior",
+    "Designed": "ring_design",
     "FilledTray": "shim_tray", "Shim": "shimming", "Solution": "solution",
     "SortedBlocks": "sorting", "Tolerance": "tolerance", "HomogeneityTolerance": "tolerance",
     "Verification": "verification"}
@@ -238,8 +240,8 @@ def page_of(result: object) -> Page:
         return page
     raise StudyError(must_be(
         "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
-        f"a {name}", "Of hf.prior, hf.check_map, hf.register and hf.field the commands of these "
-        "names write the files."))
+        f"a {name}", "Of hf.check_map and hf.register the commands of these names write the "
+        "files."))
 
 
 def csv_file(
@@ -676,9 +678,9 @@ def write_report(result: object, folder: str | Path) -> Path:
 
     Parameters
     ----------
-    result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
-HomogeneityResult, Forces, MeasurementPlan, Designed, FilledTray, Shim, SortedBlocks, Assembly, \
-Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
+    result : Solution, InferenceResult, Diagnosis, Verification, FieldOnLines, MultipoleTables, \
+HomogeneityResult, Forces, MeasuredPrior, MeasurementPlan, Designed, FilledTray, Shim, \
+SortedBlocks, Assembly, Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path
         Folder for the files; it is made if it does not exist. As on the command line, it belongs to

@@ -13,7 +13,6 @@ from scipy import special
 from halbach_fe.core.arrays import Floats, radii_of, rms
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.untrusted import write_hdf5
-from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -59,18 +58,18 @@ def _tested(prior: MeasuredPrior) -> bool:
     return any(not np.isnan(samples.p).all() for samples in prior.types)
 
 
-def _summary(magnet: Magnet, prior: MeasuredPrior) -> Plain:
+def _summary(prior: MeasuredPrior) -> Plain:
     """Return the content of prior.json.
 
     Deviations are in percent along the nominal magnetization and in degrees across it.
     """
     return {
-        "study": magnet.name, "blocks": prior.count, "placed": prior.placed,
+        "study": prior.magnet.name, "blocks": prior.count, "placed": prior.placed,
         "parameters": len(prior.nominal),
         "rms_sd_A_per_m": rms(prior.gaussian.sd),
         "rms_shift_A_per_m": rms(prior.gaussian.mean - prior.nominal),
-        "common_mode_sd": magnet.study.prior.common_mode_sd,
-        "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
+        "common_mode_sd": prior.magnet.study.prior.common_mode_sd,
+        "mounting_sd_deg": prior.magnet.study.prior.mounting_sd_deg,
         "doubts": list(prior.doubts), "far": prior.far,
         "not_normal": [samples.label for samples in prior.types if not samples.normal],
         "types": [
@@ -82,17 +81,16 @@ def _summary(magnet: Magnet, prior: MeasuredPrior) -> Plain:
     }
 
 
-def parts_table(magnet: Magnet, prior: MeasuredPrior) -> Rows:
+def parts_table(prior: MeasuredPrior) -> Rows:
     """Return rows of text: how far blocks deviate from the study, and how far they remain unknown,
     along the nominal magnetization, across it, and together.
     """
-    size, count = magnet.dimension, len(magnet.blocks)
-    uniform = slice(size * count)  # without the variations inside blocks
-    nominal = prior.nominal[uniform].reshape(count, size)
+    size, count = prior.magnet.dimension, len(prior.magnet.blocks)
+    nominal = prior.nominal.reshape(count, size)
     there = np.linalg.norm(nominal, axis=1) > 0
     nominal = nominal[there]
-    shift = (prior.gaussian.mean - prior.nominal)[uniform].reshape(count, size)[there]
-    covariance = prior.gaussian.covariance[uniform, uniform].reshape(count, size, count, size)
+    shift = (prior.gaussian.mean - prior.nominal).reshape(count, size)[there]
+    covariance = prior.gaussian.covariance.reshape(count, size, count, size)
     own = np.einsum("iaib->iab", covariance)[there]
     axes = _axes(nominal)
     square = np.sum(nominal**2, axis=1)[:, None]
@@ -172,9 +170,9 @@ def answer(prior: MeasuredPrior) -> Answer:
         (prior.placed or not odd) and not prior.doubts)
 
 
-def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
+def page(prior: MeasuredPrior) -> Page:
     """Return the page of what measured blocks say about a magnet."""
-    summary, parts, rows = _summary(magnet, prior), parts_table(magnet, prior), type_table(prior)
+    magnet, parts, rows = prior.magnet, parts_table(prior), type_table(prior)
     common, mounting = magnet.study.prior.common_mode_sd, magnet.study.prior.mounting_sd_deg
     calibration = (
         f"All blocks share a calibration error of {100 * common:.3g} % (sd)." if common > 0 else
@@ -201,7 +199,8 @@ def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
         partial(_deviations_figure, prior), "Deviation of each block from the study's "
         "magnetization: along it, and across it")}
     sizes = [1e-3 * rms(prior.gaussian.mean - prior.nominal), 1e-3 * rms(prior.gaussian.sd)]
-    return Page("prior", "prior from measured blocks", magnet.study, answer(prior), summary, [
+    return Page("prior", "prior from measured blocks", magnet.study, answer(prior),
+                _summary(prior), [
         Section([f"{calibration} {turned}"]),
         Section([
             "A block differs from the study in the length of its magnetization and in its "
@@ -218,17 +217,17 @@ def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
             f"along it, across it in the plane of the ring, and along z.{tested}",
             Table(rows, "numbers")], "By type")],
         {"Measured blocks relative to the nominal, by type": rows}, figures=figure,
-        files={"prior.h5": partial(_write_prior, magnet, prior)})
+        files={"prior.h5": partial(_write_prior, prior)})
 
 
-def _write_prior(magnet: Magnet, prior: MeasuredPrior, path: Path) -> None:
+def _write_prior(prior: MeasuredPrior, path: Path) -> None:
     """Write prior.h5."""
     data = xr.Dataset(
         {name: ("parameter", values, {"units": "A/m"}) for name, values in (
             ("nominal", prior.nominal), ("prior_mean", prior.gaussian.mean),
             ("prior_sd", prior.gaussian.sd))},
-        coords={"parameter": list(magnet.parameter_names)},
-        attrs={"study": magnet.study.model_dump_json()})
+        coords={"parameter": list(prior.magnet.parameter_names)},
+        attrs={"study": prior.magnet.study.model_dump_json()})
     data["prior_covariance"] = (("parameter", "parameter_2"), prior.gaussian.covariance,
                                 {"units": "A2/m2"})
     write_hdf5(data, path)

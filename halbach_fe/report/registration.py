@@ -410,7 +410,7 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
     Such poses predict the same readings, before and after an update. `block_images` says which
     magnets are never symmetric.
     """
-    first, second = (_axes(each) for each in (one, other))
+    first, second = (nearest_right_angles(each.instrument) for each in (one, other))
     turn = second @ first.T
     off = np.abs(other.middle_m - turn @ one.middle_m)
     if one.component != other.component:
@@ -425,18 +425,13 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
 
 def _reversed(best: Registration, assumed: Instrument | None) -> list[str]:
     """Name reversed signs as the rival of a turn after which the nominal field is the opposite."""
-    turn = _axes(best) @ nearest_right_angles(assumed or Instrument()).T
+    turn = nearest_right_angles(best.instrument) @ nearest_right_angles(assumed or Instrument()).T
     if best.component or np.trace(turn) > 3 - 1e-9 or (
             block_images(build_magnet(best.study), turn, -1) is None):
         return []
     return ["A map that is not turned, but whose readings all have the other sign (a probe the "
             "other way round, say), would read the same: this magnet's field is the opposite after "
             "that turn. Decide by how the map was measured."]
-
-
-def _axes(one: Registration) -> np.ndarray:
-    """Return the rotation by right angles (3, 3) that is nearest to the map's axes."""
-    return nearest_right_angles(one.instrument)
 
 
 def _fit(best: Registration, before: str) -> str:

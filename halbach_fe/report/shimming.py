@@ -162,6 +162,11 @@ def _sizes(shim: Shim) -> tuple[float, float]:
     return before, after
 
 
+def _sizes_by_move(shim: Shim) -> Floats:
+    """Return the rms (1 + moves,) before the moves and after each of them."""
+    return np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
+
+
 def _step_summary(shim: Shim, step: Step) -> Plain:
     """Return a move and its gain as entries of shim.json."""
     unit = aim_of(shim.model).unit
@@ -303,7 +308,7 @@ def _of_possible(shim: Shim) -> str:
 
 def _first_moves(shim: Shim) -> str:
     """Say how few of the moves make most of the gain, if not all of them are needed for that."""
-    sizes = np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
+    sizes = _sizes_by_move(shim)
     part = (sizes[0] - sizes) / (sizes[0] - sizes[-1])
     # part of the gain of all moves that the first of them make, which the answer names
     most = 0.9
@@ -317,7 +322,7 @@ def _first_moves(shim: Shim) -> str:
 
 def _together(shim: Shim) -> str:
     """Name the moves that gain only together, as the first of them alone would be a loss."""
-    sizes = np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
+    sizes = _sizes_by_move(shim)
     said, last = "", 0
     for first in np.flatnonzero(np.diff(sizes) > 0):
         less = sizes[first + 1:] < sizes[first]
@@ -465,7 +470,7 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
 def _gain_figure(shim: Shim) -> Figure:
     """Draw the rms of the values against the number of moves."""
     figure, axis = chart(3.4)
-    sizes = [known.rms for known in (shim.before, *(step.after for step in shim.steps))]
+    sizes = _sizes_by_move(shim)
     axis.plot(sizes, "-o", color=POSTERIOR)
     axis.set(xlabel="moves", ylim=(0, 1.08 * max(sizes)), ylabel="rms of |c$_n$| in units of 1e-4"
              if shim.fields is None else "rms deviation of |B| in ppm")

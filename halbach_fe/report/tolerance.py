@@ -106,8 +106,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     """Say how large the multipoles of the magnets are, how many meet the limit, and what next."""
     if isinstance(found, HomogeneityTolerance):
         return _homogeneity_answer(found)
-    largest = found.sizes.max(axis=1)
-    half, most = np.quantile(largest, (0.5, 0.95))
+    half, most = np.quantile(found.largest, (0.5, 0.95))
     worst = found.model.orders[int(np.argmax(found.quantiles[1]))]
     said = (f"Half of the magnets have all unwanted multipoles below {decimals(half)} units of "
             f"1e-4, 95 % below {decimals(most)}; the largest is mostly that of order {worst}.")
@@ -242,7 +241,7 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
     figure, axis = chart(3.6)
-    _draw_shares(axis, found.sizes.max(axis=1))
+    _draw_shares(axis, found.largest)
     if found.limit is not None:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
         legend_above(figure, axis)

@@ -43,7 +43,13 @@ from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.moments.solve import solve_moments
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
+from halbach_fe.stats.gaussian import (
+    Gaussian,
+    nominal_prior,
+    root_matrix,
+    stacked_root,
+    with_independent,
+)
 from halbach_fe.study.inference import Uncertain, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
@@ -234,11 +240,7 @@ def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:
     """Return a prior of magnetizations, and ``count`` amplitudes of variations after them."""
-    if not count:
-        return prior
-    joined = sparse.block_diag([sparse.csr_array(root_matrix(prior.root)),
-                                sparse.eye_array(count)])
-    return Gaussian(np.concatenate([prior.mean, np.zeros(count)]), stacked_root(joined))
+    return with_independent(prior, np.zeros(count), np.ones(count)) if count else prior
 
 
 STEP = 1e-3

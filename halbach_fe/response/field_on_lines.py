@@ -28,6 +28,7 @@ from scipy.integrate import cumulative_simpson, simpson
 
 from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.iron import IronSolid
@@ -128,11 +129,12 @@ class Slope:
 
 
 @dataclass(frozen=True)
-class FieldOnLines:
+class FieldOnLines(ShownInNotebook):
     """B, linear in the magnetizations, at the points of lines.
 
     Attributes
     ----------
+    magnet : Magnet
     lines : Lines
     mean : ndarray, shape (lines, count, 3), in T
         B along x, y and z.
@@ -148,8 +150,14 @@ class FieldOnLines:
         Error that the spacing of the points makes of a first integral.
     slope : Slope, optional
         Derivative of B along u. Grids of lines have it, for kicks.
+    measured : bool
+        Whether the magnetizations are those of a posterior, not of the study's prior.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
     """
 
+    magnet: Magnet
     lines: Lines
     mean: Floats
     root: Floats
@@ -159,6 +167,8 @@ class FieldOnLines:
     in_block: NDArray[np.str_]
     spacing: Floats
     slope: Slope | None = None
+    measured: bool = False
+    disagreement: str | None = None
 
     @cached_property
     def sd(self) -> Floats:
@@ -317,7 +327,7 @@ def field_on_lines(
     names = np.array([*(block.name for block in magnet.blocks),
                       *(f"iron {body}" for body in range(1, len(magnet.iron) + 1)), ""])
     return FieldOnLines(
-        lines, flux[..., 0], flux[..., 1:], error, weak.reshape(-1, *shape[1:])[:count],
+        magnet, lines, flux[..., 0], flux[..., 1:], error, weak.reshape(-1, *shape[1:])[:count],
         polarization.reshape(*shape, -1), names[number[:shape[0] * shape[1]]].reshape(shape[:2]),
         _spacing_error(magnet, lines, flux[..., 0]),
         None if beside is None else beside.slope(magnet, lines, every[count:], error))
@@ -501,11 +511,8 @@ def _through_blocks(
         return _through_cross_section(magnet, points, number, magnetizations, session)
     solved = None if magnet.is_vacuum else solve_separate(magnet, session)
     nominal, weak = _nominal_strength(magnet, points, number, solved)
-    tensors = np.array([block.recoil_tensor for block in blocks])
-    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
-                              magnetizations.root]).reshape(len(blocks), 3, -1)
-    remanence = MU_0 * tensors @ change
-    strength = np.zeros((*points.shape, change.shape[2]))
+    tensors, remanence = _remanence(magnet, magnetizations)
+    strength = np.zeros((*points.shape, remanence.shape[2]))
     for block, field in enumerate(unit_fields(blocks, points[~in_iron])):
         strength[~in_iron] += field @ remanence[block]
     if solved is not None and solved.iron is not None:
@@ -560,6 +567,16 @@ def _nominal_strength(
     return strength, error
 
 
+def _remanence(magnet: Magnet, magnetizations: Gaussian) -> tuple[Floats, Floats]:
+    """Return the recoil tensors (blocks, 3, 3), and the remanences (blocks, 3, 1 + q) in T by which
+    mean and root differ from the nominal magnet.
+    """
+    tensors = np.array([block.recoil_tensor for block in magnet.blocks])
+    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
+                              magnetizations.root]).reshape(len(tensors), magnet.dimension, -1)
+    return tensors, MU_0 * tensors[:, :, :magnet.dimension] @ change
+
+
 def _through_cross_section(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
     session: Session,
@@ -570,11 +587,8 @@ def _through_cross_section(
     parts = finite_element_part(magnet, points, session, anywhere=True)
     error = reading_errors(magnet, flux_density_at(points), parts,
                            session).reshape(-1, 3)
-    tensors = np.array([block.recoil_tensor for block in blocks])
-    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
-                              magnetizations.root]).reshape(len(blocks), 2, -1)
-    remanence = MU_0 * tensors[:, :, :2] @ change
-    flux = np.zeros((*points.shape, change.shape[2]))
+    tensors, remanence = _remanence(magnet, magnetizations)
+    flux = np.zeros((*points.shape, remanence.shape[2]))
     for block, unit in enumerate(unit_fields(blocks, points)):
         flux += (unit[..., :2] + parts.block(block, slice(None))) @ remanence[block, :2]
     flux[..., 0] += external_field(magnet, points) + field_of(blocks, points) + parts.nominal

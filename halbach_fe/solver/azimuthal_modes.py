@@ -49,7 +49,7 @@ from halbach_fe.solver.interpolation import (
     probes_of,
 )
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, open_mesh, render, variants_of
-from halbach_fe.solver.mesh import CountedMesh, Entities, VerifiedMesh
+from halbach_fe.solver.mesh import Entities, MeshedCase
 from halbach_fe.solver.session import RunSize, Session, Task, run_tasks
 
 PROBLEM = "azimuthal_modes.pro"
@@ -156,24 +156,15 @@ class _Ring:
 
 
 @dataclass(frozen=True)
-class ModesCase:
-    """The data that all runs for a magnet share."""
+class ModesCase(MeshedCase):
+    """The data that all runs for a magnet share; the mesh is that of the (r, z) half-plane."""
 
-    magnet: Magnet
-    mesh: VerifiedMesh | CountedMesh
-    """Mesh of the (r, z) half-plane."""
     weights: Floats
     """Remanence of the nominal array, see `nominal_waves`. Shape (modes, 2, rings, 3), in T."""
     solved: tuple[int, ...]
     """Numbers, from 0, of the rings that hold the blocks to solve for."""
     meridian: Floats
     """Points (r, z, 0) of the half-plane at which fields are evaluated. Shape (m, 3), in m."""
-
-    @property
-    def real_mesh(self) -> VerifiedMesh:
-        """The mesh of a run that is solved; a `CountedMesh` serves estimates only."""
-        assert isinstance(self.mesh, VerifiedMesh)
-        return self.mesh
 
     @cached_property
     def located(self) -> Located:

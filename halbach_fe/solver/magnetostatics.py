@@ -61,6 +61,7 @@ from halbach_fe.solver.mesh import (
     MESH_NAME,
     CountedMesh,
     Entities,
+    MeshedCase,
     VerifiedMesh,
     build_meridian,
     build_mesh,
@@ -291,11 +292,9 @@ def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Asse
 
 
 @dataclass(frozen=True)
-class _Case:
+class _Case(MeshedCase):
     """The data that all runs for a magnet on one mesh share."""
 
-    magnet: Magnet
-    mesh: VerifiedMesh | CountedMesh
     points: Floats
     """Shape (n, 3), in m."""
     blocks: Sequence[int]
@@ -304,12 +303,6 @@ class _Case:
     anywhere: bool
     """Whether points may lie in magnet and iron."""
     time_limit_s: float
-
-    @property
-    def real_mesh(self) -> VerifiedMesh:
-        """The mesh of a run that is solved; a `CountedMesh` serves estimates only."""
-        assert isinstance(self.mesh, VerifiedMesh)
-        return self.mesh
 
     @cached_property
     def located(self) -> Located:

@@ -109,6 +109,20 @@ class CountedMesh:
     """Extent of the mesh in m; the half length of a cross-section is infinite."""
 
 
+@dataclass(frozen=True)
+class MeshedCase:
+    """A magnet and its mesh, which all runs for it share."""
+
+    magnet: Magnet
+    mesh: VerifiedMesh | CountedMesh
+
+    @property
+    def real_mesh(self) -> VerifiedMesh:
+        """The mesh of a run that is solved; a `CountedMesh` serves estimates only."""
+        assert isinstance(self.mesh, VerifiedMesh)
+        return self.mesh
+
+
 def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
     """Mesh the cross-section of a 2D magnet, or a 3D magnet, into ``folder``.
 

@@ -200,7 +200,7 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
 
 
 def _field_of_nominal(
-    magnet: Magnet, points: Floats, session: Session, estimate: bool
+    magnet: Magnet, points: Floats, session: Session, estimate: bool = False
 ) -> Floats:
     """Return `solve_nominal`, of a cross-section at points (n, 3) in m of any z."""
     if magnet.dimension == 3:
@@ -210,21 +210,19 @@ def _field_of_nominal(
     return found + external_field(magnet, points) - external_field(magnet, plane)
 
 
-def field_function(
-    magnet: Magnet, session: Session, estimate: bool = False
-) -> Callable[[Floats], Floats]:
+def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
     It serves points that move little by little. The blocks are solved for once where that does not
     depend on the points, and the field of many blocks is summed by expansions: 24 x 12 permeable
     cubes were up to 8e-5 of their field off in the bore, 1.5e-5 rms. That of a cross-section does
-    not depend on z, but for that of external sources. ``estimate`` is that of `solve_nominal`.
+    not depend on z, but for that of external sources.
     """
     auto = magnet.study.solver.route == "auto" and not magnet.has_losses
     if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) is not Route.MOMENTS or (
             auto and is_axisymmetric(magnet)):
-        return lambda points: _field_of_nominal(magnet, points, session, estimate)
-    reaction = solve_separate(magnet, session, estimate)
+        return lambda points: _field_of_nominal(magnet, points, session)
+    reaction = solve_separate(magnet, session, estimate=False)
     vacuum = field_in_vacuum(magnet.blocks)
 
     def field(points: Floats) -> Floats:

@@ -209,6 +209,12 @@ def stacked_root(*roots: Floats | sparse.csr_array | CovarianceFactor) -> Covari
     return _sparse_root(sparse.hstack([root_matrix(root) for root in roots]))
 
 
+def with_independent(prior: Gaussian, mean: Floats, sd: Floats) -> Gaussian:
+    """Return a distribution of the same parameters and, after them, of independent ones (k,)."""
+    root = sparse.block_diag([sparse.csr_array(root_matrix(prior.root)), sparse.diags_array(sd)])
+    return Gaussian(np.concatenate([prior.mean, mean]), stacked_root(root))
+
+
 def root_matrix(root: Floats | sparse.csr_array | CovarianceFactor) -> Floats | sparse.csr_array:
     """Return a root as a single matrix, which for a prior is its sparse outer root."""
     if not isinstance(root, CovarianceFactor):

@@ -8,11 +8,6 @@ Math. 18 (2018) 309); a step of 1 makes it an independence sampler. The proposal
 ``xi' = sqrt(1 - s^2) xi + s eta`` leaves the reference invariant, so that the acceptance
 probability depends only on the ratio of the posterior and reference densities.
 
-With a surrogate, a proposal must first be accepted by a cheap model, and only accepted proposals
-are passed to the exact model (delayed acceptance). The second acceptance step corrects the error
-of the first, so that the chain samples the exact posterior (J. A. Christen, C. Fox, J. Comput.
-Graph. Statist. 14 (2005) 795).
-
 Convergence of chains is judged by R-hat, rank-normalized and split, effective sample size and Monte
 Carlo error. The definitions are those of A. Vehtari, A. Gelman, D. Simpson, B. Carpenter, P.-C.
 Buerkner, Bayesian Anal. 16 (2021) 667; ArviZ computes them.
@@ -161,7 +156,7 @@ class Chain:
 
 def sample(
     posterior: Posterior, proposals: Sequence[Proposal], count: int, generator: np.random.Generator,
-    start: Floats, surrogate: Posterior | None = None, first: int = 0,
+    start: Floats, first: int = 0,
 ) -> Chain:
     """Run a Markov chain that uses the proposals in turn; each leaves the posterior invariant.
 
@@ -177,8 +172,6 @@ def sample(
         Number of steps; each gives a sample.
     start : ndarray, shape (k,)
         Whitened coordinates z at which the chain starts.
-    surrogate : Posterior, optional
-        Posterior of a cheap model, which screens the proposals.
     first : int
         Number of the first step; step i uses the proposal ``i % len(proposals)``.
     """
@@ -189,7 +182,6 @@ def sample(
 
     z = start
     value = posterior.log_likelihood(parameters_at(z))
-    cheap = surrogate.log_likelihood(parameters_at(z)) if surrogate else 0.0
     samples = np.empty((count, len(prior.mean)))
     accepted = 0
     for number in range(count):
@@ -200,18 +192,10 @@ def sample(
         z_new = proposal.reference.to_z(xi_new)
         # log of the ratio of prior and reference densities: proposed minus current value
         weight = float(z @ z - z_new @ z_new - xi @ xi + xi_new @ xi_new) / 2
-        gain, cheap_new = weight, 0.0
-        passed = True
-        if surrogate is not None:
-            cheap_new = surrogate.log_likelihood(parameters_at(z_new))
-            screen = weight + cheap_new - cheap
-            passed = np.log(generator.uniform()) < screen
-            gain = cheap - cheap_new  # undoes the surrogate's part of the first acceptance step
-        if passed:
-            value_new = posterior.log_likelihood(parameters_at(z_new))
-            if np.log(generator.uniform()) < gain + value_new - value:
-                z, value, cheap = z_new, value_new, cheap_new
-                accepted += 1
+        value_new = posterior.log_likelihood(parameters_at(z_new))
+        if np.log(generator.uniform()) < weight + value_new - value:
+            z, value = z_new, value_new
+            accepted += 1
         samples[number] = parameters_at(z)
     return Chain(samples, accepted / max(count, 1), z)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import unit_circle
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.study.array import Array, Block, BlockException
+from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
@@ -226,28 +226,6 @@ def _moved(body: Body, exceptions: Sequence[BlockException]) -> Body:
     return replace(body, displacement=vector(shift), rotation=vector(turn))
 
 
-@dataclass(frozen=True)
-class RingValues:
-    """The values of one ring: its own, and those of the array where it has none.
-
-    The names are those of `halbach_fe.study.array.Ring`, of which exactly one strength is given.
-    """
-
-    multipole_order: int
-    blocks_per_ring: int
-    inner_radius_m: float
-    outer_radius_m: float
-    ring_length_m: float | None
-    ring_gap_m: float
-    first_block_angle_deg: float
-    first_magnetization_angle_deg: float
-    recoil_permeability: float
-    recoil_permeability_across: float | None
-    remanence_T: float | None
-    block_moment_A_m2: float | None
-    block: Block
-
-
 def magnet_of(study: Study) -> TrueMagnet:
     """Return the nominal magnet of a study, with the deviations that its exceptions describe.
 
@@ -257,7 +235,7 @@ def magnet_of(study: Study) -> TrueMagnet:
         If a block cannot be as the study describes it.
     """
     array, dimension = study.array, study.dimension
-    rings = [ring_values(array, ring) for ring in range(1, array.rings + 1)]
+    rings = [array.of_ring(ring) if array.ring else array for ring in range(1, array.rings + 1)]
     bodies = tuple(_body(values, ring, slot, z, dimension)
                    for ring, (values, z) in enumerate(zip(
                        rings, _ring_middles(array, rings, dimension), strict=True), start=1)
@@ -278,20 +256,7 @@ def magnet_of(study: Study) -> TrueMagnet:
         dipoles=tuple((each.position_m, each.moment_A_m2) for each in external.dipoles))
 
 
-def ring_values(array: Array, ring: int) -> RingValues:
-    """Return the values that hold for a ring (from 1)."""
-    keys = RingValues.__dataclass_fields__
-    values = {key: getattr(array, key) for key in keys}
-    if array.ring:
-        own = {key: value for key in keys
-               if (value := getattr(array.ring[ring - 1], key)) is not None}
-        if "remanence_T" in own or "block_moment_A_m2" in own:
-            values |= {"remanence_T": None, "block_moment_A_m2": None}
-        values |= own
-    return RingValues(**values)
-
-
-def _ring_middles(array: Array, rings: list[RingValues], dimension: int) -> list[float]:
+def _ring_middles(array: Array, rings: list[Array], dimension: int) -> list[float]:
     """Return the middle of every ring along z in m.
 
     Rings of a layer are stacked in their order, each stack centred at z = 0.
@@ -314,7 +279,7 @@ def _ring_middles(array: Array, rings: list[RingValues], dimension: int) -> list
     return middles.tolist()
 
 
-def _body(values: RingValues, ring: int, slot: int, z: float, dimension: int) -> Body:
+def _body(values: Array, ring: int, slot: int, z: float, dimension: int) -> Body:
     step = 2 * np.pi / values.blocks_per_ring
     angle = np.radians(values.first_block_angle_deg) + (slot - 1) * step
     direction = np.radians(values.first_magnetization_angle_deg) + (
@@ -335,7 +300,7 @@ def _body(values: RingValues, ring: int, slot: int, z: float, dimension: int) ->
                 vector(remanence * np.array(easy)), easy, along, across)
 
 
-def _shape(values: RingValues, length: float, facing: float) -> SectorBody | PrismBody:
+def _shape(values: Array, length: float, facing: float) -> SectorBody | PrismBody:
     inner, outer, block = values.inner_radius_m, values.outer_radius_m, values.block
     half = np.pi / values.blocks_per_ring
     if block.shape == "sector":

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, spread
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
-from halbach_fe.core.files import atomic
+from halbach_fe.core.files import write_text
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
@@ -437,12 +437,8 @@ def campaign_files(campaign: SimulatedCampaign) -> dict[str, Callable[[Path], No
             for name, data in (("map", campaign.readings), ("held-out", campaign.held_out))
             if data is not None}
 
-    def write_truth(path: Path) -> None:
-        with atomic(path) as temporary:
-            temporary.write_text(truth_text(campaign.truth), encoding="utf-8")
-
     return {"blocks.csv": partial(write_blocks, campaign.blocks), **maps,
-            "truth/truth.json": write_truth}
+            "truth/truth.json": partial(write_text, text=truth_text(campaign.truth))}
 
 
 def write_campaign(campaign: SimulatedCampaign, folder: Path) -> list[Path]:

@@ -14,7 +14,6 @@ from halbach_fe.core.arrays import Ints
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, Page, Section, Table, Text, figure_of
 from halbach_fe.report.words import counted, fraction, p_value
-from halbach_fe.stats.small_samples import BINS
 
 CONTROL = "control: "
 """Beginning of the name of a posterior that is wrong on purpose."""
@@ -75,6 +74,7 @@ def page(
 
 def _ranks_figure(ranks: Mapping[str, Ints], draws: int) -> Figure:
     """Draw the histogram of the ranks for every kind of posterior."""
+    bins = 10  # of each histogram, as of the test
     panels_in_a_row = 3  # more would be unreadable on a narrow screen
     columns = min(panels_in_a_row, len(ranks))
     rows = -(-len(ranks) // columns)
@@ -83,7 +83,7 @@ def _ranks_figure(ranks: Mapping[str, Ints], draws: int) -> Figure:
     for axis in axes[len(ranks):]:
         axis.remove()
     for axis, (name, case_ranks) in zip(axes, ranks.items(), strict=False):
-        edges = np.linspace(0, draws + 1, BINS + 1)
+        edges = np.linspace(0, draws + 1, bins + 1)
         axis.hist(case_ranks.ravel(), edges, density=True, color=POSTERIOR)
         axis.axhline(1 / (draws + 1), color=PUBLISHED)
         axis.set(title="\n".join(wrap(name, 28)), xlabel="rank of the true value", yticks=[])

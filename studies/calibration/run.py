@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from calibration_page import page
+from truth_ranks import Sampler, Simulator, ranks, uniformity
 
 from halbach_fe.cli import common
 from halbach_fe.cli.options import positive, positive_number
@@ -43,7 +44,6 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, independent_noise, nominal_prior
 from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
-from halbach_fe.stats.small_samples import Sampler, Simulator, ranks, uniformity
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study

@@ -37,6 +37,7 @@ from drawn_studies import (
     drawn_study,
 )
 from sealed_cases_page import page
+from stated_probabilities import error_if_calibrated, expected_calibration_error, frequencies
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, HalbachError
@@ -59,11 +60,6 @@ from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.small_samples import (
-    error_if_calibrated,
-    expected_calibration_error,
-    frequencies,
-)
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study

@@ -23,15 +23,17 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import observe
-from halbach_fe.report import magnetizations
 from halbach_fe.report.inference import page
-from halbach_fe.report.magnetizations import error_summary
 from halbach_fe.report.page import write_files
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import predict
 from halbach_fe.study.measurement import FluxDensity, PointPositions
 from halbach_fe.study.reader import read_study
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what several studies share
+from magnetizations_page import error_summary
+from magnetizations_page import page as page_of_magnetizations
 
 HERE = Path(__file__).parent
 HOMOGENEOUS_M = (-0.43, 0.42)
@@ -80,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         name: errors(one) | error_summary(one, truth) for name, one in known.items()}}
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
-    write_files(magnetizations.page(
+    write_files(page_of_magnetizations(
         build_magnet(study), known, truth, "the magnetizations of FASER's twin", ring=5),
         arguments.output)
     common.print_table(

@@ -22,12 +22,14 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.report.magnetizations import error_summary, expected_spread, page
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what several studies share
+from magnetizations_page import error_summary, expected_spread, page
 
 HERE = Path(__file__).parent
 SEED = 11

@@ -24,11 +24,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.magnetizations import error_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what several studies share
+from magnetizations_page import error_summary, page
 
 HERE = Path(__file__).parent
 CASES = {"paper": "the paper's truth", "drawn": "a truth drawn from the prior"}

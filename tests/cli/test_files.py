@@ -216,7 +216,7 @@ VERBS_WITH_FOLDERS = {
     "register": ("study", "--measurements", "map"), "report": ("folder",)}
 """Options of every command that writes a folder."""
 
-LONG = ("verify", "field", "design", "shim-tray", "register")
+LONG = ("verify", "design", "shim-tray", "register")
 """Those that are not run to their end, as they take long; their names are in the same table."""
 
 

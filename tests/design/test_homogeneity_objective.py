@@ -26,8 +26,9 @@ from halbach_fe.report import shimming, sorting
 from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.tolerance import OF_THE_DESIGN
 from halbach_fe.report.tolerance import answer as answer_of_tolerance
-from halbach_fe.response.homogeneity import default_region, homogeneity_model
+from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.multipoles import MultipoleReference
+from halbach_fe.response.region import default_region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of

@@ -20,7 +20,8 @@ from halbach_fe.design.ring_search import Task, _best_pair, search
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.ring_design import STUDY_FILE, answer
-from halbach_fe.response.homogeneity import PPM, Region
+from halbach_fe.response.homogeneity import PPM
+from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import Ring
 from halbach_fe.study.design import HomogeneityRegion

@@ -25,7 +25,8 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import html_of, write_report
-from halbach_fe.response.homogeneity import PPM, Region, extremes
+from halbach_fe.response.homogeneity import PPM, extremes
+from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0

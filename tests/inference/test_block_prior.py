@@ -253,7 +253,6 @@ def test_moments_in_another_unit_are_asked_for_it(vacuum_dipole, generator):
 def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, tmp_path):
     """All blocks 30 % stronger, or all at 80 degrees, is no table to be taken without a word."""
     study = vacuum_dipole()
-    magnet = build_magnet(study)
     slots, rings, truth = blocks_and_truth(study, generator)
     count = len(slots)
 
@@ -264,7 +263,7 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     assert prior(truth, temperature=np.full(count, 25.0)).doubts == ()
     with pytest.warns(HalbachWarning, match="measured at 80 °C, 60 K from 20 °C"):
         found = prior(truth, temperature=np.full(count, 80.0))
-    write_files(page(magnet, found), tmp_path)
+    write_files(page(found), tmp_path)
     assert "7.2 % off" in json.loads((tmp_path / "prior.json").read_text())["doubts"][0]
     assert "Not yet. The blocks were measured" in answer(found).trust
     assert not answer(found).sound
@@ -711,7 +710,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     slots, _, truth = blocks_and_truth(study, generator, copies=8)
     magnet = build_magnet(study)
     healthy = prior_from_blocks(magnet, table_of(study, slots, truth))
-    write_files(page(magnet, healthy), tmp_path)
+    write_files(page(healthy), tmp_path)
     assert "Only as mean and spread" not in (tmp_path / "prior.html").read_text()
     with xr.open_dataset(tmp_path / "prior.h5", engine="h5netcdf") as stored:
         np.testing.assert_allclose(stored["prior_covariance"], healthy.gaussian.covariance)
@@ -720,7 +719,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     table = table_of(study, slots, truth)
     with (pytest.warns(HalbachWarning, match="block B3 is 14 % weaker"),
           pytest.warns(HalbachWarning, match="type 4 do not look normally")):
-        write_files(page(magnet, prior_from_blocks(magnet, table)), tmp_path)
+        write_files(page(prior_from_blocks(magnet, table)), tmp_path)
     assert "Only as mean and spread" in (tmp_path / "prior.html").read_text()
     summary = json.loads((tmp_path / "prior.json").read_text())
     assert summary["not_normal"] == ["4"]

@@ -8,8 +8,8 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.stats.gaussian import nominal_prior
-from halbach_fe.stats.small_samples import ranks, uniformity
 from halbach_fe.study.reader import read_study
+from studies.calibration.truth_ranks import ranks, uniformity
 from tests.conftest import ROOT, module_of
 
 BLOCK_SIZE_M = 0.014

@@ -18,13 +18,8 @@ from halbach_fe.measurement.field_map import field_map, total_field_map
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.report.homogeneity import answer
 from halbach_fe.report.page import write_report
-from halbach_fe.response.homogeneity import (
-    Homogeneity,
-    Region,
-    real_harmonics,
-    region_points,
-    sphere_points,
-)
+from halbach_fe.response.homogeneity import Homogeneity, real_harmonics
+from halbach_fe.response.region import Region, region_points, sphere_points
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.response.test_magnetic_axis import true_field

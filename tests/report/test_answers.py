@@ -32,6 +32,7 @@ from halbach_fe.report import (
     campaign,
     demagnetization,
     diagnosis_figures,
+    field,
     forces,
     homogeneity,
     inference_answer,
@@ -55,8 +56,8 @@ from halbach_fe.report.words import (
     share_in_words,
     with_error,
 )
-from halbach_fe.response.homogeneity import Region
 from halbach_fe.response.multipoles import MultipoleReference, Multipoles
+from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -467,8 +468,17 @@ def of_infer(given):
         flux_density(float(np.sqrt(np.mean(off**2)))), f"{given.updated.prior_conflict:.3g}"]
 
 
-ANSWERS = (of_solve, of_verify, of_multipoles, of_homogeneity, of_forces, of_plan, of_prior,
-           of_sort, of_shim, of_tolerance, of_demagnetization, of_simulate, of_infer)
+def of_field(given):
+    lines = hf.Lines((0, 0, -0.2), (0, 0, 0.2), count=41)
+    found = hf.field(given.magnet, lines, given.session)
+    first, sd = found.integrals(1)
+    return field.answer(found), [
+        flux_density(float(np.linalg.norm(found.mean, axis=2).max()), 4), "1 line of 41 points",
+        with_error(float(first[0, 0]), float(sd[0, 0])), "as ordered"]
+
+
+ANSWERS = (of_solve, of_verify, of_field, of_multipoles, of_homogeneity, of_forces, of_plan,
+           of_prior, of_sort, of_shim, of_tolerance, of_demagnetization, of_simulate, of_infer)
 
 
 @pytest.mark.parametrize("of", ANSWERS, ids=lambda of: of.__name__)
@@ -663,7 +673,7 @@ def test_the_parts_of_a_deviation_add_up(given):
     """By squares, to what the answer says; an angle in degrees is a part of the length."""
     found = prior_from_blocks(given.magnet, given.campaign.blocks)
     assert len(found.nominal) == 3 * len(given.magnet.blocks)
-    for row, size in zip(prior.parts_table(given.magnet, found), (
+    for row, size in zip(prior.parts_table(found), (
             found.gaussian.mean - found.nominal, found.gaussian.sd), strict=True):
         _, length, *angles, together = row.values()
         assert len(angles) == 2

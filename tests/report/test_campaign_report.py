@@ -257,7 +257,6 @@ def edited_page(content):
 @pytest.mark.parametrize(("make", "said"), [
     (lambda folder: None, "does not exist"), (lambda folder: folder.write_text("1"), "a file"),
     (lambda folder: folder.mkdir(), "no run.json"), (no_page, "no page.json"),
-    (edited_record(files={}, command="halbach-fe field"), "writes tables alone. Leave it out"),
     (edited_record(ended=""), "failed, was killed"), (edited_record(files={}), "no page.json"),
     (edited_record(command="rm -rf /"), "of `rm -rf /`"),
     (edited_record(command="halbach-fe report"), "halbach-fe report"),

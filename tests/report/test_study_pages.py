@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import magnetizations
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
+from studies import magnetizations_page as magnetizations
 from studies.calibration import calibration_page as calibration
 from studies.diagnosis import sealed_cases_page as sealed_cases
 from studies.sensitivity import sensitivity_page as sensitivity

@@ -20,14 +20,8 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import halbach_ring
 from halbach_fe.report.page import write_report
-from halbach_fe.response.homogeneity import (
-    SURFACE_DEGREE,
-    Region,
-    extremes,
-    real_harmonics,
-    region_points,
-    sphere_points,
-)
+from halbach_fe.response.homogeneity import extremes, real_harmonics
+from halbach_fe.response.region import SURFACE_DEGREE, Region, region_points, sphere_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.stats.small_samples import (
+from studies.diagnosis.stated_probabilities import (
     Bin,
     error_if_calibrated,
     expected_calibration_error,

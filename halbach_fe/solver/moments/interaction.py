@@ -206,14 +206,16 @@ class Interaction:
                     degree, moments)
         return moments.real.copy(), moments.imag.copy()
 
-    def _far(self, far: Neighbours, targets: Clusters, places: Floats, dipoles: Floats,
-             degree: int) -> Floats:
-        """Return the field (n, q, 3) of far clusters at places (n, q, 3) of target items."""
-        return self._far_of(far, targets, places, lambda: self._moments(dipoles, degree), degree)
+    def _far(self, dipoles: Floats, degree: int) -> Floats:
+        """Return the field (n, q, 3) of far clusters at the nodes of every cell."""
+        return self._far_at(self._pairs[0], self.clusters, self.cells.nodes,
+                            lambda: self._moments(dipoles, degree), degree)
 
-    def _far_of(self, far: Neighbours, targets: Clusters, places: Floats,
+    def _far_at(self, far: Neighbours, targets: Clusters, places: Floats,
                 moments_of: Callable[[], tuple[Floats, Floats]], degree: int) -> Floats:
-        """Return `_far` from a function that returns the moments of clusters."""
+        """Return the field (n, q, 3) of far clusters at places (n, q, 3) of target items, from a
+        function that returns the moments of clusters.
+        """
         found = np.zeros_like(places)
         if not len(far.sources):
             return found
@@ -248,25 +250,24 @@ class Interaction:
 
     def mean_field(self, polarization: Floats, degree: int | None = None) -> Floats:
         """Return the mean of mu_0 H (n, 3) in T over every cell, for a polarization (n, 3) in T."""
-        cells = self.cells
-        far, close = self._pairs
-        found = cells.mean(self._far(
-            far, self.clusters, cells.nodes, self.dipoles(polarization),
-            degree or self.degree))
+        found = self.cells.mean(self._far(self.dipoles(polarization), degree or self.degree))
+        self._add_near_means(polarization, found)
+        return found
+
+    def _add_near_means(self, polarization: Floats, found: Floats) -> None:
+        """Add the mean of mu_0 H (n, 3) in T of near cells over every cell."""
+        close = self._pairs[1]
         in_threads(lambda first, last: near.add_means(
             close.starts, close.sources, self._matrices, polarization, first, last, found),
             close.shares(16))
-        return found
 
     def mean_field_of_deviations(self, deviations: Floats, degree: int) -> Floats:
         """Return the mean of mu_0 H (n, 3) in T over every cell, of polarizations (n, q, 3) in T.
 
         Their means over cells must vanish: near cells are treated by reciprocity.
         """
-        cells = self.cells
-        far, close = self._pairs
-        dipoles = self.dipoles(deviations)
-        found = cells.mean(self._far(far, self.clusters, cells.nodes, dipoles, degree))
+        cells, close, dipoles = self.cells, self._pairs[1], self.dipoles(deviations)
+        found = cells.mean(self._far(dipoles, degree))
         in_threads(lambda first, last: near.add_of_deviations(
             close.starts, close.sources, first, last, self.arrays, cells.nodes, dipoles,
             cells.volume, found), close.shares(32))
@@ -274,13 +275,16 @@ class Interaction:
 
     def node_field(self, polarization: Floats) -> Floats:
         """Return mu_0 H (n, q, 3) in T at the nodes of every cell."""
-        cells = self.cells
-        far, close = self._pairs
-        found = self._far(far, self.clusters, cells.nodes, self.dipoles(polarization), self.degree)
-        in_threads(lambda first, last: near.add_at_nodes(
-            close.starts, close.sources, first, last, self.arrays, cells.nodes, polarization,
-            found), close.shares(32))
+        found = self._far(self.dipoles(polarization), self.degree)
+        self._add_near_at_nodes(polarization, found)
         return found
+
+    def _add_near_at_nodes(self, polarization: Floats, found: Floats) -> None:
+        """Add mu_0 H (n, q, 3) in T of near cells at the nodes of every cell."""
+        close = self._pairs[1]
+        in_threads(lambda first, last: near.add_at_nodes(
+            close.starts, close.sources, first, last, self.arrays, self.cells.nodes, polarization,
+            found), close.shares(32))
 
     def field_along(self, along: Floats) -> Callable[[Floats], tuple[Floats, Floats]]:
         """Return a function for a polarization (n, 3) in T that changes from call to call.
@@ -289,8 +293,7 @@ class Interaction:
         (n, q), and the mean of mu_0 H (n, 3), both in T. Matrices of near pairs are kept in single
         precision, which leaves 1e-7 of the field, unless there are more than `MOST_KEPT`.
         """
-        cells = self.cells
-        far, close = self._pairs
+        cells, close = self.cells, self._pairs[1]
         kept: NDArray[np.float32] | None = None
         if len(close.sources) <= MOST_KEPT:
             targets, (first, kinds, _) = close.targets, self._kinds
@@ -302,16 +305,11 @@ class Interaction:
                 share_out(len(targets)))
 
         def field(polarization: Floats) -> tuple[Floats, Floats]:
-            at_nodes = self._far(
-                far, self.clusters, cells.nodes, self.dipoles(polarization), self.degree)
+            at_nodes = self._far(self.dipoles(polarization), self.degree)
             mean = cells.mean(at_nodes)
-            in_threads(lambda first, last: near.add_means(
-                close.starts, close.sources, self._matrices, polarization, first, last, mean),
-                close.shares(16))
+            self._add_near_means(polarization, mean)
             if kept is None:
-                in_threads(lambda first, last: near.add_at_nodes(
-                    close.starts, close.sources, first, last, self.arrays, cells.nodes,
-                    polarization, at_nodes), close.shares(32))
+                self._add_near_at_nodes(polarization, at_nodes)
                 return np.einsum("nqi,ni->nq", at_nodes, along), mean
             component = np.einsum("nqi,ni->nq", at_nodes, along)
             in_threads(lambda first, last: near.add_along(
@@ -405,7 +403,7 @@ class Interaction:
                 return np.zeros((len(points), 3))
             targets = Clusters.of(points, np.zeros(len(points)))
             far, close = self._pairs_with(targets, 1 / self._reach)
-            found = self._far_of(far, targets, points[:, None], moments,
+            found = self._far_at(far, targets, points[:, None], moments,
                                  self.reading_degree)[:, 0]
             in_threads(lambda first, last: near.add_of_parts(
                 close.starts, close.sources, first, last, self.arrays, self.cells.cuts, points,

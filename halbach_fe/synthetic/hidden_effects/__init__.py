@@ -21,6 +21,9 @@ EFFECTS: dict[str, HiddenEffect] = {
     effect.name: effect
     for effect in (*magnet_effects.EFFECTS, *instrument_effects.EFFECTS)}
 
+AXES, COUNTS = ("axis", "first", "second"), ("blocks", "more")
+"""Names of parameters that are axes, from 1 or as letters, and of those that count."""
+
 RequestedEffect = tuple[HiddenEffect, tuple[float, ...] | None]
 """An effect and its values; None if these are to be drawn."""
 
@@ -48,7 +51,8 @@ def parse_hidden_effect(text: str) -> RequestedEffect:
     if not equals:
         return effect, None
     parameters = signature(effect)
-    axes = {"x": 1, "y": 2, "z": 3} if name in ("swapped_axes", "sign_flipped_axis") else {}
+    of_axes = {parameter.name for parameter in effect.parameters} <= {*AXES}
+    axes = {"x": 1, "y": 2, "z": 3} if of_axes else {}
     try:
         values = tuple(float(axes.get(value.strip(), value))
                        for value in rest.split(",")) if rest else ()
@@ -107,15 +111,9 @@ WHOLE_BLOCK = ("block_missing", "block_flipped", "block_put_in_wrongly")
 
 def _as_named(hidden: ChosenEffect) -> str:
     """Return the name of an effect with the block or ring that it is of."""
-    place = [f"{value:g}" for parameter, value in zip(
-        hidden.effect.parameters, hidden.values, strict=True)
-        if parameter.name in ("ring", "slot")]
+    place = [f"{value:g}" for name, value in hidden.by_name.items() if name in ("ring", "slot")]
     name = " or ".join(WHOLE_BLOCK) if hidden.effect.name in WHOLE_BLOCK else hidden.effect.name
     return f"{name}={','.join(place)}" if place else name
-
-
-NEAREST_M = 1e-3
-"""Smallest distance of a neighbouring magnet."""
 
 
 def _check_size(site: Site, hidden: ChosenEffect) -> None:
@@ -124,7 +122,6 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
         raise StudyError(must_be(f"{what} of --hide {hidden.effect.name}", "the study", expected,
                                  f"{received:g}", hint))
 
-    values = {}
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
         unit = f" {parameter.unit}" if parameter.unit else ""
         low, high = parameter.limits
@@ -132,59 +129,26 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
             key = "coefficient_per_K" if parameter.unit == "1/K" else f"_{parameter.unit}"
             refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value,
                    wrong_unit(key, value, {"ge": low, "le": high}))
-        values[parameter.name] = value
-    if hidden.effect.name == "iron_ring":
-        if values["inner_radius"] < site.outer:
-            refuse("inner_radius", f"at least the outer radius of the magnet, {site.outer:g} m",
-                   values["inner_radius"])
-        if values["outer_radius"] <= values["inner_radius"]:
-            refuse("outer_radius", f"above inner_radius, {values['inner_radius']:g} m",
-                   values["outer_radius"])
-    if hidden.effect.name == "inner_radius":
-        thickness = site.outer - site.inner
-        if abs(values["change"]) >= min(site.inner, thickness):
-            refuse("change", f"smaller than the inner radius ({site.inner:g} m) and the thickness "
-                   f"of the blocks ({thickness:g} m)", values["change"])
-    for name in ("blocks", "more"):
-        if values.get(name, 0.0) != int(values.get(name, 0.0)):
-            refuse(name, "a whole number", values[name])
-    if hidden.effect.name == "neighbour_magnet" and abs(values["distance"]) < NEAREST_M:
-        refuse("distance", f"at least {NEAREST_M:g} m on either side", values["distance"])
-    if hidden.effect.name.startswith("temperature") and (
-            abs(values["change"] * values["coefficient"]) >= 1):
-        refuse("coefficient", "a fraction per kelvin that does not reverse the magnetization",
-               values["coefficient"])
-    if hidden.effect.name == "ferromagnetic_object":
-        radius = (3 * values["volume"] / (4 * np.pi))**(1 / 3)
-        from_axis = float(np.hypot(values["x"], values["y"]))
-        away = max(from_axis - site.outer, site.inner - from_axis,
-                   abs(values["z"]) - site.half_length)
-        if away < radius:
-            refuse("position", f"more than {radius:.3g} m away from the blocks, the radius of a "
-                   "sphere of this volume", away)
-    if hidden.effect.name == "blocks_swapped" and hidden.values[:2] == hidden.values[2:]:
-        refuse("other_slot", "that of another block", values["other_slot"])
-    if hidden.effect.name == "swapped_axes" and values["first"] == values["second"]:
-        refuse("second", "another axis than the first", values["second"])
+        if parameter.name in COUNTS and value != int(value):
+            refuse(parameter.name, "a whole number", value)
+    if hidden.effect.check and (refused := hidden.effect.check(site, hidden.by_name)):
+        refuse(*refused)
 
 
 def _check_place(site: Site, hidden: ChosenEffect) -> None:
     """Raise a StudyError if an effect is at a ring, slot, seam or axis that does not exist."""
-    # of a magnetization gradient, ring and slot 0 stand for all blocks
-    lowest = 0 if hidden.effect.name == "magnetization_gradient" else 1
     limits = {"ring": site.rings, "slot": site.slots, "other_ring": site.rings,
-              "other_slot": site.slots, "seam": site.rings - 1, "axis": 3, "first": 3, "second": 3}
-    if lowest == 0 and (hidden.values[0] == 0) != (hidden.values[1] == 0):
-        raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
-                                 "those of a block, or both 0 for all", "one of them 0"))
-    values = dict(zip((parameter.name for parameter in hidden.effect.parameters), hidden.values,
-                      strict=True))
+              "other_slot": site.slots, "seam": site.rings - 1, **dict.fromkeys(AXES, 3)}
+    values = hidden.by_name
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
-        highest = limits.get(parameter.name)
+        highest, lowest = limits.get(parameter.name), 1 if parameter.least is None else 0
         if highest is not None and (value != int(value) or not lowest <= value <= highest):
             raise StudyError(must_be(f"{parameter.name} of --hide {hidden.effect.name}",
                                      "the study", f"a whole number from {lowest} to {highest}",
                                      f"{value:g}"))
+    if (values.get("ring") == 0) != (values.get("slot") == 0):  # 0 stands for all blocks
+        raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
+                                 "those of a block, or both 0 for all", "one of them 0"))
     for prefix in ("", "other_"):
         place = values.get(f"{prefix}ring", 0.0), values.get(f"{prefix}slot", 0.0)
         if all(place) and place not in site.places:

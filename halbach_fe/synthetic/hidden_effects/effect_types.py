@@ -6,7 +6,7 @@ or to the mapper.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -147,6 +147,12 @@ def parameters(
 Draw = Callable[[Site, np.random.Generator], tuple[float, ...]]
 """Function that draws the values of an effect's parameters."""
 
+Values = Mapping[str, float]
+"""The values of an effect by the names of their parameters."""
+Refused = tuple[str, str, float] | None
+"""What is refused of values, what it must be, and what it is; None if they can be."""
+Check = Callable[[Site, Values], Refused]
+
 
 @dataclass(frozen=True)
 class HiddenEffect:
@@ -169,6 +175,8 @@ class HiddenEffect:
     of_blocks: bool = False
     """Whether the blocks have the effect before they are mounted, so that the Helmholtz coil
     measures it too."""
+    check: Check | None = None
+    """Refuses values that are possible alone, but not together or not in this magnet."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +185,12 @@ class ChosenEffect:
 
     effect: HiddenEffect
     values: tuple[float, ...]
+
+    @property
+    def by_name(self) -> Values:
+        """The values by the names of their parameters."""
+        return {parameter.name: value for parameter, value in zip(
+            self.effect.parameters, self.values, strict=True)}
 
     def plain(self) -> dict[str, object]:
         """Return the effect as plain data for the truth."""

@@ -15,10 +15,13 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects.effect_types import (
+    Check,
     Draw,
     HiddenEffect,
     Need,
+    Refused,
     Site,
+    Values,
     draw_direction,
     draw_length,
     draw_number,
@@ -181,9 +184,16 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
         for body in bodies))
 
 
-def _gross(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need) -> HiddenEffect:
+def _gross(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
+           check: Check | None = None) -> HiddenEffect:
     """Return a gross error of the instrument."""
-    return replace(_fault(name, stated, draw, apply, *needs), group="gross")
+    return replace(_fault(name, stated, draw, apply, *needs), group="gross", check=check)
+
+
+def _of_two_axes(_: Site, values: Values) -> Refused:
+    """Refuse an axis that is exchanged with itself."""
+    return None if values["first"] != values["second"] else (
+        "second", "another axis than the first", values["second"])
 
 
 def _nothing(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
@@ -196,7 +206,7 @@ GROSS_ERRORS = (
     _gross("wrong_radius", "change m", lambda site, generator: (
         signed_log_uniform(generator, 0.05, 0.2) * (
             site.radius if site.radius > 0 else site.inner),), _plus("radius_error")),
-    _gross("swapped_axes", "first, second", _draw_swap, _swapped, "axes"),
+    _gross("swapped_axes", "first, second", _draw_swap, _swapped, "axes", check=_of_two_axes),
     _gross("sign_flipped_axis", "axis", lambda site, generator: (
         float(1 + "xyz".index(generator.choice(site.components))),), _sign_flipped, "axes"),
     _gross("millimetres", "", _nothing, lambda instrument, site: replace(

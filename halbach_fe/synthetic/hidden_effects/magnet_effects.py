@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import unit_circle
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.hidden_effects.effect_types import (
+    Check,
     Draw,
     HiddenEffect,
     Need,
+    Refused,
     Site,
+    Values,
     draw_direction,
     draw_length,
     draw_number,
@@ -450,19 +453,66 @@ def _draw_ring(draw: Callable[[Site, np.random.Generator], float]) -> Draw:
     return lambda site, generator: (draw_place(site, generator)[0], draw(site, generator))
 
 
+def _around(site: Site, values: Values) -> Refused:
+    """Refuse iron that is not around the magnet."""
+    inner, outer = values["inner_radius"], values["outer_radius"]
+    if inner < site.outer:
+        return ("inner_radius", f"at least the outer radius of the magnet, {site.outer:g} m", inner)
+    return None if outer > inner else ("outer_radius", f"above inner_radius, {inner:g} m", outer)
+
+
+def _leaves_blocks(site: Site, values: Values) -> Refused:
+    """Refuse a change of the inner radius that leaves no bore, or no blocks."""
+    thickness, change = site.outer - site.inner, values["change"]
+    return None if abs(change) < min(site.inner, thickness) else (
+        "change", f"smaller than the inner radius ({site.inner:g} m) and the thickness of the "
+        f"blocks ({thickness:g} m)", change)
+
+
+def _keeps_direction(_: Site, values: Values) -> Refused:
+    """Refuse a change of temperature that reverses the magnetization."""
+    return None if abs(values["change"] * values["coefficient"]) < 1 else (
+        "coefficient", "a fraction per kelvin that does not reverse the magnetization",
+        values["coefficient"])
+
+
+def _beside(_: Site, values: Values) -> Refused:
+    """Refuse a neighbouring magnet in the place of this one."""
+    nearest_m = 1e-3
+    return None if abs(values["distance"]) >= nearest_m else (
+        "distance", f"at least {nearest_m:g} m on either side", values["distance"])
+
+
+def _outside_of_blocks(site: Site, values: Values) -> Refused:
+    """Refuse a sphere that reaches into blocks."""
+    radius = (3 * values["volume"] / (4 * np.pi))**(1 / 3)
+    from_axis = float(np.hypot(values["x"], values["y"]))
+    away = max(from_axis - site.outer, site.inner - from_axis, abs(values["z"]) - site.half_length)
+    return None if away >= radius else (
+        "position", f"more than {radius:.3g} m away from the blocks, the radius of a sphere of "
+        "this volume", away)
+
+
+def _of_two_blocks(_: Site, values: Values) -> Refused:
+    """Refuse a block that changes places with itself."""
+    return None if (values["ring"], values["slot"]) != (
+        values["other_ring"], values["other_slot"]) else (
+        "other_slot", "that of another block", values["other_slot"])
+
+
 def _effect(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
-            of_blocks: bool = False, **limits: Any) -> HiddenEffect:
+            of_blocks: bool = False, check: Check | None = None, **limits: Any) -> HiddenEffect:
     """Return an effect of the magnet, whose parameters are stated as in `parameters`."""
     return HiddenEffect(name, "field", parameters(stated, **limits), draw, apply, needs=needs,
-                        of_blocks=of_blocks)
+                        of_blocks=of_blocks, check=check)
 
 
 RADIUS, LOST, PERMEABILITY = (1e-4, 100.0), (0.0, 1.0), (-0.5, 10.0)
 
 EFFECTS = (
     _effect("iron_ring", "inner_radius m, outer_radius m, relative_permeability, "
-            "saturation_polarization T", _draw_iron, iron_ring, "no iron", inner_radius=RADIUS,
-            outer_radius=RADIUS, relative_permeability=(1.0, 1e6),
+            "saturation_polarization T", _draw_iron, iron_ring, "no iron", check=_around,
+            inner_radius=RADIUS, outer_radius=RADIUS, relative_permeability=(1.0, 1e6),
             saturation_polarization=(0.0, 3.0)),
     _effect("recoil_permeability", "change", _draw_recoil, recoil_permeability, of_blocks=True,
             change=PERMEABILITY),
@@ -495,7 +545,8 @@ EFFECTS = (
     _effect("halves_apart", "slot, apart m, sideways m, z m", lambda site, generator: (
         draw_place(site, generator)[1], site.scale * log_uniform(generator, 2e-4, 1e-3), 0.0, 0.0),
         halves_apart, "3d", "equal rings"),
-    _effect("blocks_swapped", "ring, slot, other_ring, other_slot", _draw_swap, blocks_swapped),
+    _effect("blocks_swapped", "ring, slot, other_ring, other_slot", _draw_swap, blocks_swapped,
+            check=_of_two_blocks),
     _effect("block_put_in_wrongly", "ring, slot, radial rad, azimuthal rad, z rad",
             lambda site, generator: (*draw_place(site, generator), np.pi, 0.0, 0.0),
             block_put_in_wrongly),
@@ -511,23 +562,24 @@ EFFECTS = (
     _effect("corners_demagnetized", "fraction", draw_number(0.03, 0.3, False),
             corners_demagnetized, "four edges", fraction=LOST),
     _effect("magnetization_gradient", "ring, slot, fraction", _draw_gradient,
-            magnetization_gradient, "four edges", of_blocks=True, fraction=(-1.0, 1.0)),
+            magnetization_gradient, "four edges", of_blocks=True, ring=(0.0,), slot=(0.0,),
+            fraction=(-1.0, 1.0)),
     _effect("temperature", "change K, coefficient 1/K", lambda site, generator: (
-        signed_log_uniform(generator, 2, 15), SMCO), temperature,
+        signed_log_uniform(generator, 2, 15), SMCO), temperature, check=_keeps_direction,
         change=(-293.0,)),  # from room temperature, not below absolute zero
     _effect("temperature_gradient", "change K, coefficient 1/K", lambda site, generator: (
-        signed_log_uniform(generator, 3, 15), SMCO), temperature_gradient),
+        signed_log_uniform(generator, 3, 15), SMCO), temperature_gradient, check=_keeps_direction),
     _effect("inner_radius", "change m", draw_length(1e-4, 6e-4), inner_radius, "equal rings",
-            of_blocks=True),
+            of_blocks=True, check=_leaves_blocks),
     _effect("length", "fraction", draw_number(5e-4, 4e-3), magnet_length, "3d", "equal rings",
             of_blocks=True, fraction=(-0.5, 0.5)),
     _effect("background", "x T, y T, z T", lambda site, generator: tuple(
         float(value) for value in log_uniform(generator, 5e-5, 5e-4)
         * np.array(draw_direction(generator, site.dimension))), background),
     _effect("neighbour_magnet", "distance m", _draw_neighbour, neighbour_magnet, "3d",
-            distance=(-100.0, 100.0)),
+            check=_beside, distance=(-100.0, 100.0)),
     _effect("ferromagnetic_object", "x m, y m, z m, volume m^3", _draw_object,
-            ferromagnetic_object, "3d", volume=(1e-12,)),
+            ferromagnetic_object, "3d", check=_outside_of_blocks, volume=(1e-12,)),
     _effect("knee", "coercivity A/m, squareness", lambda site, generator: (
         generator.uniform(5.0e5, 5.8e5), generator.uniform(0.8, 0.9)), knee, "3d", "vacuum",
         "few blocks", "four edges", coercivity=(1.0,), squareness=(0.01, 1.0)))
