@@ -33,14 +33,14 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.infer import neighbour_columns
+from halbach_fe.inference.infer import neighbour_readings, seen_columns
 from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns, joined
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.measurement.campaign import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import study_prior
+from halbach_fe.response.block_variation import neighbour_prior, study_prior
 from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.routes import check_points, field_function
@@ -241,7 +241,8 @@ def _beside(
     """
     terms = OpenTerms.of([one])
     found = [shared_error.reshape(-1, len(readings.values)).T,
-             neighbour_columns(magnet, [one], readings)]
+             seen_columns(neighbour_readings(magnet, [one], readings)
+                          @ neighbour_prior(magnet).root, readings)]
     if len(terms):
         found.append(terms.columns(field, [one], readings) * terms.sd)
     if any(each.is_of_instrument for each in one.study.uncertain):
