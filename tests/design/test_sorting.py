@@ -13,8 +13,8 @@ from halbach_fe.design.sorting import sort_blocks
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
-from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.magnets import halbach_ring
+from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.report.sorting import answer
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.exact_block_field import field_of
@@ -210,8 +210,8 @@ def test_the_seed_decides(session):
 
 @pytest.mark.parametrize("region", [None, {"sphere_m": 0.01}])
 def test_sorted_magnets_have_the_bars_of_neighbours_blocks(region):
-    """Strengths of single blocks change the field by as much of each block's. The bars were those of
-    the magnet's own blocks alone, which were measured to 1e-5.
+    """Strengths of single blocks change the field by as much of each block's. The bars were those
+    of the magnet's own blocks alone, which were measured to 1e-5.
     """
     strength_sd = 0.02
     magnet = halbach_ring(
