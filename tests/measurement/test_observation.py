@@ -253,7 +253,7 @@ COIL = {"kind": "round", "current_A": 5.0, "turns": 1000, "radius_m": 0.06, "cen
 
 @pytest.mark.parametrize("external", [
     {"neighbours": [{"z_m": 0.085}]}, {"coils": [COIL]},
-    {"dipoles": [{"position_m": [0.0, 0.0, 0.1], "moment_A_m2": [3.0, 0.0, 30.0]}]}])
+    {"dipoles": [{"position_m": [0.0, 0.0, 0.1], "moment_A_m2": [30.0, 0.0, 300.0]}]}])
 def test_noise_of_positions_in_the_gradient_of_external_sources(external):
     """By differences of magpylib's field. The noise was that of the magnet's blocks alone, which is
     the control.
@@ -266,7 +266,7 @@ def test_noise_of_positions_in_the_gradient_of_external_sources(external):
         sources.append(loops(0.06, 0.1, 0.004, 5000.0))
     if "dipoles" in external:
         sources.append(magpylib.misc.Dipole(
-            moment=(3.0, 0.0, 30.0), position=(0, 0, 0.1)))
+            moment=(30.0, 0.0, 300.0), position=(0, 0, 0.1)))
     points = np.array([[0.0, 0.0, 0.045], [0.005, 0.003, 0.05], [-0.004, 0.006, 0.04]])
     sd, step = np.array([1e-4, 2e-4, 3e-4]), 1e-5
     gradient = np.stack([sum(source.getB(points + step * axis) - source.getB(points - step * axis)
