@@ -456,8 +456,7 @@ def multipoles(
     models, left_out = multipole_models(magnet, references, session)
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
-        (model, {name: model.of(distribution, before=name == "prior")
-                 for name, distribution in distributions.items()})
+        (model, {name: model.of(distribution) for name, distribution in distributions.items()})
         for model in models], disagreement_of(posterior, magnet), left_out)
 
 
@@ -502,7 +501,7 @@ def field(
     """
     known = (assembled_prior(magnet, nominal_parameters(magnet)) if posterior is None
              else list(distributions_of(magnet, posterior).values())[-1])
-    found = field_on_lines(magnet, lines, known, session, inside, before=posterior is None)
+    found = field_on_lines(magnet, lines, known, session, inside)
     most, nothing_T = 0.01, 1e-12  # a smaller field is rounding, as on the axis of a quadrupole
     if (spacing := found.relative_spacing) > most and np.abs(found.mean).max() > nothing_T:
         warnings.warn(f"The {lines.count} points of a line are too far apart for its integrals: "
@@ -562,7 +561,7 @@ def homogeneity(
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     of_map, misfit, remarks = ({}, 1.0, ()) if data is None else map_homogeneity(
         magnet, data, model)
-    by_name = {name: model.of(distribution, measured=name != "prior", before=name == "prior")
+    by_name = {name: model.of(distribution, measured=name != "prior")
                for name, distribution in distributions.items()}
     if MAP in of_map and (remark := of_other_size(of_map[MAP], list(by_name.values())[-1])):
         remarks = (*remarks, remark)
@@ -682,7 +681,7 @@ def shim(
     distributions_of(result.magnet, result)
     check_objective(result.magnet, reference, limit_units, limit_ppm)
     model = objective_of(result.magnet, reference, session.within("objective"),
-                         result.posterior.mean)
+                         result.posterior.stacked.mean)
     budget: dict[Kind, int] = {"swap": swaps, "cycle": cycles, "turn": turns,
                                "replace": replacements}
     return choose_moves(result, model, np.random.default_rng(seed), budget,

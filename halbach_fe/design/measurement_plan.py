@@ -33,14 +33,14 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.infer import neighbour_columns
+from halbach_fe.inference.infer import neighbour_readings, seen_columns
 from halbach_fe.inference.instrument_fit import open_columns
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.measurement.campaign import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import study_prior, with_variations
+from halbach_fe.response.block_variation import neighbour_prior, study_prior, with_variations
 from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.region import Region, default_region, region_points
@@ -242,7 +242,8 @@ def _beside(
     """
     return np.hstack([
         shared_error.reshape(-1, len(readings.values)).T,
-        neighbour_columns(magnet, [one], readings),
+        seen_columns(neighbour_readings(magnet, [one], readings) @ neighbour_prior(magnet).root,
+                     readings),
         open_columns(one.study, field, [one], readings)])
 
 

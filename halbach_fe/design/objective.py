@@ -91,6 +91,9 @@ class DeviationModel:
     """Error bar of the solver for these. Shape (1 + k,), in T."""
     nominal: Floats
     """Nominal magnetization. Shape (parameters,), in A/m."""
+    of_neighbours: Floats
+    """Rows for what the magnetizations of neighbours' blocks deviate, which a distribution knows
+    beside its parameters. Shape (1 + k, neighbours' parameters), in T m/A."""
 
     @cached_property
     def nominal_main(self) -> float:
@@ -103,8 +106,8 @@ class DeviationModel:
 
     def of(self, parameters: Gaussian) -> Deviations:
         """Return the deviations for normally distributed magnetizations in A/m."""
-        return self.known(self.offset + self.matrix @ parameters.mean,
-                          self.matrix @ parameters.root)
+        mean, root = parameters.products(self.matrix, self.of_neighbours)
+        return self.known(self.offset + mean, root)
 
     def known(self, mean: Floats, root: Floats) -> Deviations:
         """Return the deviations for a mean (1 + k,) and a root (1 + k, q) of the values in T.
@@ -126,21 +129,23 @@ class DeviationModel:
 def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> DeviationModel:
     """Return the linear model of the deviations of |B| about the field of a magnet.
 
-    ``about`` (parameters,) in A/m: magnetizations of that magnet; by default the nominal ones.
+    ``about`` (parameters,) in A/m: magnetizations of that magnet, which those of neighbours' blocks
+    may follow; by default the nominal ones.
     """
-    response = model.response
+    response, others = model.response, model.of_neighbours
     inner = np.flatnonzero(model.weights > 0)
     weights = model.weights[inner]
     rows = (3 * inner[:, None] + np.arange(3)).ravel()
-    matrix, offset = response.matrix[rows], response.offset[rows]
-    field = (offset + matrix @ (response.nominal if about is None else about)).reshape(-1, 3)
+    matrix, offset, others = response.matrix[rows], response.offset[rows], others[rows]
+    field = model.field((response.nominal if about is None else about)[:, None])[inner, :, 0]
     along = field / np.linalg.norm(field, axis=1, keepdims=True)
 
     def of_size(values: Floats) -> Floats:
         """Return the part along the field (n, ...) of values (3 n, ...)."""
         return np.einsum("nc,nc...->n...", along, values.reshape(len(along), 3, -1))
 
-    size = np.hstack([of_size(matrix), of_size(offset)])  # the last column is that of the offset
+    # the last column is that of the offset
+    size = np.hstack([of_size(others), of_size(matrix), of_size(offset)])
     mean = weights @ size
     apart = np.sqrt(weights)[:, None] * (size - mean)
     scale = float(np.abs(response.nominal).max())
@@ -153,9 +158,11 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     kept = vectors[:, values > kept_share * values[-1]]
     values = np.vstack([mean, kept.T @ apart])
     error = np.sqrt(weights) * np.linalg.norm(response.error[rows].reshape(-1, 3), axis=1)
+    beside = others.shape[1]
     return DeviationModel(
-        model, values[:, :-1], values[:, -1],
-        np.append(np.linalg.norm(error), np.sqrt((kept**2).T @ error**2)), response.nominal)
+        model, values[:, beside:-1], values[:, -1],
+        np.append(np.linalg.norm(error), np.sqrt((kept**2).T @ error**2)), response.nominal,
+        values[:, :beside])
 
 
 Known = Multipoles | Deviations

@@ -239,6 +239,8 @@ class _MoveModel:
     placed: Floats
     """Covariance factor of the mounted blocks, along the axes of the magnet.
     Shape (S, D, q), in A/m."""
+    beside: Gaussian | None
+    """What the blocks of neighbours deviate, with the same columns."""
     loose_mean: Floats
     """Mean of the blocks once they are taken out, in own axes. Shape (B, D), in A/m."""
     loose: Floats
@@ -263,9 +265,11 @@ class _MoveModel:
     @cached_property
     def start(self) -> tuple[Any, Any]:
         """Mean (1 + k,) and root (1 + k, q) of the products with the matrix, without moves."""
-        matrix = self.model.matrix
-        return (self.model.offset + matrix @ self.mean.ravel(),
-                matrix @ self.placed.reshape(self.mean.size, -1))
+        model: Any = self.model
+        mean, root = Gaussian(
+            self.mean.ravel(), self.placed.reshape(self.mean.size, -1), self.beside).products(
+                model.matrix, model.of_neighbours)
+        return model.offset + mean, root
 
     @cached_property
     def slots(self) -> Slots:
@@ -337,7 +341,8 @@ class _MoveModel:
             mean[to], root[to] = carried @ self.loose_mean[block], carried @ self.loose[block]
             fresh.append(np.zeros((*mean.shape, self.size)))
             fresh[-1][to] = carried @ self.own[block]
-        return Gaussian(mean.ravel(), np.concatenate([root, *fresh], axis=2).reshape(mean.size, -1))
+        every = np.concatenate([root, *fresh], axis=2).reshape(mean.size, -1)
+        return Gaussian(mean.ravel(), every, _widened(self.beside, every.shape[1]))
 
     def gains(
         self, chosen: Sequence[Move], further: Sequence[Move]
@@ -521,7 +526,16 @@ def _build_move_model(
     fits[0, spares.slot[bound], count + bound] = True
     return _MoveModel(
         model, mounts, result.posterior.mean.reshape(count, size),
-        placed.reshape(count, size, columns), own_mean, own_loose, _covariance_root(alone), fits)
+        placed.reshape(count, size, columns), _widened(result.posterior.beside, columns), own_mean,
+        own_loose, _covariance_root(alone), fits)
+
+
+def _widened(known: Gaussian | None, columns: int) -> Gaussian | None:
+    """Return a distribution whose root has so many columns, the last of them zeros."""
+    if known is None:
+        return None
+    root = np.asarray(known.root)
+    return Gaussian(known.mean, np.pad(root, ((0, 0), (0, columns - root.shape[1]))))
 
 
 def _no_spares() -> SpareBlocks:

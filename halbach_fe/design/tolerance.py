@@ -16,7 +16,7 @@ import scipy.linalg as linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.block_variation import with_others
+from halbach_fe.response.block_variation import with_neighbours, with_others
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles
 from halbach_fe.stats.gaussian import (
@@ -155,7 +155,8 @@ def assembled_prior(
     """Return the study's prior of all parameters of assembled magnets.
 
     It has the tolerances of the blocks, the error that they share, the random angles by which
-    blocks are turned when they are mounted, and what else the study has as uncertain.
+    blocks are turned when they are mounted, and what else the study has as uncertain; beside these
+    what the blocks of neighbours deviate.
 
     Parameters
     ----------
@@ -168,13 +169,14 @@ def assembled_prior(
     settings, size = magnet.study.prior, magnet.dimension
     uniform = nominal[:size * len(magnet.blocks)]
     if measured is not None:
-        return with_others(measured, magnet, len(nominal) - len(uniform))
+        return with_neighbours(
+            magnet, with_others(measured, magnet, len(nominal) - len(uniform)))
     blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
                            settings.common_mode_sd)
     turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return with_others(
+    return with_neighbours(magnet, with_others(
         Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),
-        magnet, len(nominal) - len(uniform))
+        magnet, len(nominal) - len(uniform)))
 
 
 def predict_tolerance(
@@ -192,8 +194,8 @@ def predict_tolerance(
     limit : float, optional
         Limit of every |c_n|, in units of 1e-4.
     """
-    mean = model.offset + model.matrix @ prior.mean
-    root = model.root_of(prior, before=True)
+    mean, root = prior.products(model.matrix, model.of_neighbours)
+    mean = model.offset + mean
     # a QR decomposition reduces the covariance factor to a square one of the same covariance
     parts = np.vstack([root.real, root.imag])
     (small,) = linalg.qr(parts.T, mode="r")
@@ -222,8 +224,7 @@ def predict_homogeneity(
     """
     at_once = 200  # number of magnets whose fields are computed at a time, which limits the memory
     parts = [model.deviations(model.drawn(
-        prior, min(at_once, draws - first), generator, before=True))
+        prior, min(at_once, draws - first), generator))
         for first in range(0, draws, at_once)]
     mean, rms, whole = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return HomogeneityTolerance(magnet.study, model, model.of(prior, before=True),
-                                mean, rms, whole, limit)
+    return HomogeneityTolerance(magnet.study, model, model.of(prior), mean, rms, whole, limit)

@@ -24,7 +24,12 @@ from halbach_fe.measurement.instrument import (
     sensor_positions,
     with_memory,
 )
-from halbach_fe.solver.exact_block_field import block_gradients, external_field, unit_fields
+from halbach_fe.solver.exact_block_field import (
+    block_gradients,
+    external_field,
+    external_gradient,
+    unit_fields,
+)
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -117,13 +122,8 @@ class NominalFields:
 
         Element ``[i, c, j]`` is the derivative of component c along direction j.
         """
-        own, external = self.block_gradients.sum(axis=0), self.study.external
-        if not (external.neighbours or external.dipoles or external.coils):
-            return np.asarray(own)
-        step = 1e-4 * np.eye(3)  # in m, small beside the distance of any source
-        return np.asarray(own + np.stack([
-            external_field(self.magnet, self.points + one)
-            - external_field(self.magnet, self.points - one) for one in step], axis=2) / 2e-4)
+        return np.asarray(
+            self.block_gradients.sum(axis=0) + external_gradient(self.magnet, self.points))
 
     @cached_property
     def finite_element_field(self) -> Floats:

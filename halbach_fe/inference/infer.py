@@ -55,9 +55,11 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import (
     Deviations,
     distribution_of,
-    neighbour_deviations,
+    neighbour_columns,
+    neighbour_parameters,
     study_prior,
     with_magnetizations,
+    with_neighbours,
     with_others,
 )
 from halbach_fe.response.matrix import Response, response_matrix
@@ -343,9 +345,13 @@ class _Search:
         """Return the update of all parameters by the readings for training."""
         model = readings.projected(vectors, self.session.folder)
         if self.error is None:  # one for all updates: they are compared by their probabilities
-            self.error, self.shared_error = model.error, _seen(model.shared_error.T, readings)
+            self.error, self.shared_error = model.error, seen_columns(
+                model.shared_error.T, readings)
         matrix: Rows = model.matrix
-        exact, of_field, prior = matrix, matrix, self._prior_of_blocks(len(model.parameters))
+        prior = self._prior_of_blocks(len(model.parameters)).stacked
+        if len(prior.mean) > len(model.parameters):
+            matrix = Beside(matrix, neighbour_readings(self.magnet, self.maps, readings))
+        exact, of_field = matrix, matrix
         for of, columns, mean, sd in self._beside(readings):
             matrix, prior = Beside(matrix, columns), with_independent(prior, mean, sd)
             exact = Beside(exact, 0 * columns if of == "solver" else columns)
@@ -359,16 +365,17 @@ class _Search:
                                    np.flatnonzero(training)))
 
     def _prior_of_blocks(self, parameters: int) -> Gaussian:
-        """Return the prior of the ``parameters`` of the blocks."""
+        """Return the prior of the ``parameters`` of the blocks, with neighbours' blocks beside."""
         if self.prior is not None:
             return self.prior
         others = parameters - len(self.magnet.parameter_names)
-        return study_prior(self.magnet, others) if self.of_blocks is None else with_others(
-            self.of_blocks.gaussian, self.magnet, others)
+        return with_neighbours(self.magnet, study_prior(
+            self.magnet, others) if self.of_blocks is None else with_others(
+                self.of_blocks.gaussian, self.magnet, others))
 
     def _beside(
         self, readings: Readings
-    ) -> Iterator[tuple[Literal["instrument", "neighbours", "solver"], Floats, Floats, Floats]]:
+    ) -> Iterator[tuple[Literal["instrument", "solver"], Floats, Floats, Floats]]:
         """Yield of what it is, derivatives, prior mean and prior standard deviations of what is
         beside blocks.
 
@@ -381,9 +388,6 @@ class _Search:
                 with_instruments(self.magnet.study, self.maps),
                 self.nominal_field if self.at is None else self.at.field, self.maps, readings)
             yield "instrument", columns, *_unit_prior(columns)
-        neighbours = neighbour_columns(self.magnet, self.maps, readings)
-        if neighbours.size:
-            yield "neighbours", neighbours, *_unit_prior(neighbours)
         if self.shared_error is not None and self.shared_error.size:
             yield "solver", self.shared_error, *_unit_prior(self.shared_error)
         if self.at is not None:
@@ -417,8 +421,9 @@ class _Search:
         of_blocks = self.of_blocks if self.prior is None else None
         readings, whole = last.readings, last.whole
         prior, posterior, before = last.prior, whole, last.predicted(last.prior)
-        if len(whole.mean) > len(last.model.parameters):
-            prior, posterior = of_the_first([prior, whole], len(last.model.parameters))
+        own, others = len(last.model.parameters), neighbour_parameters(magnet)
+        if len(whole.mean) > own:
+            prior, posterior = of_the_first([prior, whole], own, others)
         return InferenceResult(
             magnet=magnet.with_study(with_instruments(magnet.study, self.maps)),
             observation=readings.observation, readings=readings.values,
@@ -441,7 +446,7 @@ class _Search:
                 self.terms.names, self.terms.counted @ self.total, self._sd_of_terms(),
                 self.terms.sd, at_rest, _poses(self.terms, self.maps, whole))
             if len(self.terms) else None,
-            amplitudes=_amplitudes(magnet.study, whole, len(last.model.parameters)),
+            amplitudes=_amplitudes(magnet.study, whole, own, others),
             overlaps=overlaps(last.matrix, last.residual, last.errors, last.prior, readings),
             regions_left_out=left_out(last.matrix, last.residual, last.errors, last.prior,
                                       readings),
@@ -453,19 +458,22 @@ def _unit_prior(columns: Floats) -> tuple[Floats, Floats]:
     return np.zeros(columns.shape[1]), np.ones(columns.shape[1])
 
 
-def neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
-    """Return readings (n, k) in T of neighbours' blocks that deviate by a standard deviation."""
+def neighbour_readings(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+    """Return readings (n, k) in T per A/m of what the magnetizations of neighbours' blocks
+    deviate.
+    """
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))
     found = []
     for one in maps:
         instrument = one.study.instrument
         points = probe_points(instrument, points_of(in_si_and_magnet_axes(instrument, one.data)))
-        found.append(neighbour_deviations(magnet, points) @ sensor_matrix(instrument).T)
-    return _seen(readings.observation.read(np.concatenate(found, axis=1)).T, readings)
+        found.append(np.moveaxis(neighbour_columns(magnet, points), 2, 0)
+                     @ sensor_matrix(instrument).T)
+    return readings.observation.read(np.concatenate(found, axis=1)).T
 
 
-def _seen(columns: Floats, readings: Readings) -> Floats:
+def seen_columns(columns: Floats, readings: Readings) -> Floats:
     """Return columns (n, k) in T with the covariance of others (n, m) in T, without those that are
     lost in the noise of all readings together.
     """
@@ -475,16 +483,19 @@ def _seen(columns: Floats, readings: Readings) -> Floats:
     return np.asarray(left[:, seen] * sizes[seen])
 
 
-def _amplitudes(study: Study, posterior: Gaussian, parameters: int) -> Amplitudes | None:
+def _amplitudes(
+    study: Study, posterior: Gaussian, parameters: int, beside: int
+) -> Amplitudes | None:
     """Return what an update found of the uncertain amplitudes of a study.
 
-    Those of the magnet are the last of its ``parameters``, those of instruments come after these.
+    Those of the magnet are the last of its ``parameters``, those of instruments come after these
+    and so many ``beside``.
     """
     found = sorted(study.uncertain, key=lambda one: one.is_of_instrument)
     if not found:
         return None
-    last = parameters + sum(one.is_of_instrument for one in found)
-    own = slice(last - len(found), last)
+    own = np.arange(len(found)) + parameters - len(study.uncertain_of_magnet)
+    own[len(study.uncertain_of_magnet):] += beside
     scale = np.array([one.sd for one in found])
     rows = np.eye(len(posterior.mean))[own]
     return Amplitudes(tuple(one.name for one in found), scale * posterior.mean[own],

@@ -303,15 +303,17 @@ class Beside:
         return np.hstack([self.matrix[rows], self.columns[rows]])
 
 
-def of_the_first(distributions: Sequence[Gaussian], count: int) -> list[Gaussian]:
-    """Return the distributions of the first parameters of some that share an outer root."""
-    outer = root_matrix(distributions[0].root)[:count]
-    found = []
-    for each in distributions:
-        root = each.root
-        assert isinstance(root, CovarianceFactor)
-        found.append(Gaussian(each.mean[:count],
-                              CovarianceFactor(outer, root.directions, root.remaining)))
+def of_the_first(
+    distributions: Sequence[Gaussian], count: int, beside: int = 0
+) -> list[Gaussian]:
+    """Return the distributions of the first parameters of some that share an outer root, with so
+    many beside that follow them.
+    """
+    found = [each.split(count, beside) for each in distributions]
+    outer = root_matrix(found[0].root)
+    for number, each in enumerate(found):
+        assert isinstance(each.root, CovarianceFactor)
+        found[number] = replace(each, root=replace(each.root, outer=outer))
     return found
 
 

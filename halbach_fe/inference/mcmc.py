@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError
+from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError, must_be
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.installation import code_digest
 from halbach_fe.core.untrusted import read_hdf5, with_checksum
@@ -189,13 +189,21 @@ def sample_posterior(
 
 
 def check_sampling(magnet: Magnet) -> None:
-    """Refuse a magnet whose non-linear model needs a mesh that it cannot have.
+    """Refuse a magnet whose non-linear model needs a mesh that it cannot have, or that stands
+    beside others, whose blocks deviate too and are no parameters of the model.
 
     Raises
     ------
     StudyError
-        If a 3D array does not consist of equal rings, which the mesh of the model takes them to be.
+        If a 3D array does not consist of equal rings, which the mesh of the model takes them to be,
+        or the study has neighbours.
     """
+    if magnet.external.neighbours:
+        raise StudyError(must_be(
+            "`external.neighbours`", f"study {magnet.name}", "left out, to sample the posterior "
+            "(--samples)", f"{len(magnet.external.neighbours)} of them",
+            "Leave --samples out: the posterior with linearized iron has what the blocks of "
+            "neighbours deviate, which the chains do not."))
     if magnet.dimension == 3 and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings to sample the "

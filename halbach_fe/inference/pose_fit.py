@@ -74,7 +74,13 @@ from halbach_fe.measurement.observation import (
     observe_total,
 )
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.response.block_variation import STEP, Deviations, neighbour_deviations, study_prior
+from halbach_fe.response.block_variation import (
+    STEP,
+    Deviations,
+    neighbour_columns,
+    neighbour_prior,
+    study_prior,
+)
 from halbach_fe.solver.routes import field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, largest_directions, root_matrix
@@ -548,9 +554,9 @@ class PoseFit:
         columns = flat.reshape(len(middle), 3, -1)
         smallest = SEEN * self.smallest_sigma
         directions = largest_directions(flat, smallest)
-        others = neighbour_deviations(self.magnet, middle)
-        others = np.moveaxis(others, 0, -1) @ largest_directions(
-            others.reshape(len(others), len(flat)).T, smallest)
+        others = neighbour_columns(self.magnet, middle).reshape(len(flat), -1) @ neighbour_prior(
+            self.magnet).root
+        others = (others @ largest_directions(others, smallest)).reshape(len(middle), 3, -1)
         return _BlockColumns(
             middle, np.concatenate([columns @ directions, others], axis=2), shift, directions)
 

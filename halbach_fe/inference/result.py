@@ -367,7 +367,8 @@ class InferenceResult(ShownInNotebook):
     response : Response
         The linear model of the readings.
     prior, posterior : Gaussian
-        Distributions of the magnetizations (parameters,) in A/m.
+        Distributions of the magnetizations (parameters,) in A/m, with those of neighbours' blocks
+        beside.
     prediction_prior, prediction_posterior : Prediction
         Their predictions of all readings.
     prediction_exact : Prediction
@@ -481,8 +482,9 @@ class InferenceResult(ShownInNotebook):
         if not self.study.uncertain_of_magnet:
             return self
         count = len(self.response.parameters) - len(self.study.uncertain_of_magnet)
-        prior, posterior = (Gaussian(each.mean[:count], np.asarray(each.root)[:count])
-                            for each in (self.prior, self.posterior))
+        prior, posterior = (
+            replace(each, mean=each.mean[:count], root=np.asarray(each.root)[:count])
+            for each in (self.prior, self.posterior))
         response = replace(
             self.response, matrix=self.response.whole[:, :count],
             parameters=self.response.parameters[:count], nominal=self.response.nominal[:count])

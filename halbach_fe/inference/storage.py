@@ -122,6 +122,13 @@ def _with_version(disagreement: str, magnet: Magnet, study: Study) -> str:
                        f"`{key}`.".lstrip())
 
 
+NEIGHBOURS_LEFT_OUT = (
+    "Only with care. The file of this posterior is of an earlier version, which did not keep what "
+    "the update found of the neighbours' blocks: they count as before the map. Run halbach-fe "
+    "infer again.")
+"""What is said of a posterior whose study has neighbours, and whose file does not know them."""
+
+
 class StoredPosterior(dict[str, Gaussian]):
     """Distributions of the magnetizations in A/m, ``prior`` and ``posterior``, of a file."""
 
@@ -141,6 +148,9 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
     distributions = {"prior": update.prior, "posterior": update.posterior}
     for name, distribution in distributions.items():
         magnetization.update(_stored_root(name, distribution, update.prior))
+        if distribution.beside is not None:
+            magnetization[f"{name}_neighbours_mean"] = (
+                "neighbours_parameter", distribution.beside.mean, {"units": "A/m"})
         if len(update.response.parameters) <= written_covariance:
             magnetization[f"{name}_covariance"] = (
                 ("parameter", "parameter_2"), distribution.covariance, {"units": "A2/m2"})
@@ -173,9 +183,13 @@ def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
                            for name in ("disagreement", "reservation"))
             distributions.disagreement = said or Reservation(open_)
         for name in ("prior", "posterior"):
+            mean = untrusted.finite_array(data[f"{name}_mean"], own.shape)
+            if (others := data.get(f"{name}_neighbours_mean")) is not None:
+                mean = np.append(mean, untrusted.finite_array(others, (others.size,)))
             distributions[name] = Gaussian(
-                untrusted.finite_array(data[f"{name}_mean"], own.shape),
-                _read_root(data, name, distributions.get("prior"), len(own)))
+                mean, _read_root(data, name, distributions.get("prior"), len(mean)))
+        for name, each in distributions.items():
+            distributions[name] = each.split(len(own), len(each.mean) - len(own))
     except (OSError, KeyError, ValueError, TypeError, RecursionError) as error:
         if isinstance(error, ChangedContentError) and _looks_like_a_posterior(path):
             raise OutputError(must_be(
@@ -186,8 +200,12 @@ def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
             reason or "a file that cannot be read as such")) from None
     check_same_magnet(magnet, study, own, "--posterior", str(path))
-    if distributions.disagreement is not None:
-        distributions.disagreement = _with_version(distributions.disagreement, magnet, study)
+    known = distributions.disagreement
+    if known is not None:
+        if study.external.neighbours and distributions["posterior"].beside is None and (
+                not known or isinstance(known, Reservation)):
+            known = Reservation(f"{known} {NEIGHBOURS_LEFT_OUT}".lstrip())
+        distributions.disagreement = _with_version(known, magnet, study)
     return distributions
 
 
@@ -208,7 +226,7 @@ def _stored_root(name: str, distribution: Gaussian, prior: Gaussian) -> dict[str
             and root.outer is root_matrix(prior.root)):
         return {f"{name}_directions": (("coordinate", "direction"), root.directions),
                 f"{name}_left": ("direction", root.remaining)}
-    rows = sparse.csr_array(root_matrix(root))
+    rows = sparse.csr_array(root_matrix(distribution.stacked.root))
     return {f"{name}_root": (f"{name}_entry", rows.data, {"units": "A/m"}),
             f"{name}_root_column": (f"{name}_entry", rows.indices),
             f"{name}_root_row_start": (f"{name}_row", rows.indptr, {"columns": rows.shape[1]})}

@@ -16,7 +16,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import TOTAL_SIGMA_COLUMN, is_total_field
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix
 from halbach_fe.measurement.observation import TOTAL, Observation
-from halbach_fe.solver.exact_block_field import gradient_of
+from halbach_fe.solver.exact_block_field import external_gradient, gradient_of
 from halbach_fe.stats.gaussian import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
 
@@ -112,11 +112,11 @@ def readings_per_displacement(
     """Return the changes of the readings if each of n points is displaced along each axis of the
     stage, which may be turned in the magnet.
 
-    The field gradient is that of the magnet's blocks in vacuum. The reaction field of recoil
-    permeability and iron, some per cent of the field in the bore, is neglected: the result only
-    sets the size of the noise. Deviations of the blocks have a gradient of their own, which is
-    the larger part where the nominal field is uniform: an update therefore estimates the noise
-    again with the blocks as they are updated.
+    The field gradient is that of the magnet's blocks in vacuum and of external sources. The
+    reaction field of recoil permeability and iron, some per cent of the field in the bore but more
+    beside poles, is neglected: the result only sets the size of the noise. Deviations of the blocks
+    have a gradient of their own, which is the larger part where the nominal field is uniform: an
+    update therefore estimates the noise again with the blocks as they are updated.
 
     Parameters
     ----------
@@ -136,7 +136,8 @@ def readings_per_displacement(
     """
     instrument = magnet.study.instrument
     moved = rotation_matrix(instrument.rotation_rad) * sd  # columns, in the magnet
-    gradient = sensor_matrix(instrument) @ gradient_of(magnet.blocks, points) @ moved
+    gradient = sensor_matrix(instrument) @ (
+        gradient_of(magnet.blocks, points) + external_gradient(magnet, points)) @ moved
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
         analysis @ sparse.bsr_array((gradient, number[:-1], number)))

@@ -333,7 +333,7 @@ def page(found: HomogeneityResult) -> Page:
     every, region = {**found.by_name, **found.of_map}, found.model.region.text
     rows, harmonics = homogeneity_rows(every), harmonic_rows(found)
     figures: dict[str, tuple[Callable[[], Figure], str]] = {"homogeneity.png": (
-        partial(slices_figure, found.model.slices(found.distributions[name].mean), best.mean_T),
+        partial(slices_figure, found.model.slices(found.distributions[name]), best.mean_T),
         "Deviation of |B| from its mean over the region (dashed), in planes through its "
         f"centre, {_known_as(name)}")}
     files = {}

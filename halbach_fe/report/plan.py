@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, azimuths_of, rms
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.instrument import prior_sd
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -170,11 +169,10 @@ def _beside_all_of_the_study(plan: MeasurementPlan) -> str:
 
 
 def _of_the_instrument(study: Study) -> str:
-    """Say that the plan takes the instrument as exact, if the study does not."""
-    known = [study.instrument_sd, *(one.instrument_sd for one in study.maps if one.instrument_sd)]
-    return "" if not any(prior_sd(one).any() for one in known) else (
-        "They take the instrument as exact: what [instrument_sd] leaves open, such as a gain that "
-        "all readings share, is not in them, and leaves more of the blocks' common strength.")
+    """Say what of the instrument the plan takes as known, though the study does not."""
+    return "" if not study.instrument_sd.drift_T else (
+        "The drift that [instrument_sd] leaves open is not in them, as it needs the order of the "
+        "readings.")
 
 
 def page(plan: MeasurementPlan) -> Page:

@@ -173,7 +173,7 @@ def page(found: FilledTray) -> Page:
     """Return the page of a tray, with the table to fill it from."""
     tray, filled = found.magnet.study.shim_tray, found.filled_study
     assert tray is not None
-    before, after = (model.slices(known.mean) for model, known in (
+    before, after = (model.slices(known) for model, known in (
         (found.model, found.before_known), (found.shimmed, found.after_known)))
     text = ("Deviation of |B| from its mean over the region (dashed), in planes through its "
             "centre, with {}")

@@ -203,33 +203,54 @@ def study_prior(magnet: Magnet, count: int) -> Gaussian:
         settings.direction_sd_deg, settings.common_mode_sd), magnet, count)
 
 
-def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
-    """Return the blocks of each neighbour, and what they deviate (blocks, 3, k) in T of remanence
-    by independent modes.
+def neighbour_prior(magnet: Magnet) -> Gaussian:
+    """Return the prior of what the magnetizations of neighbours' blocks deviate, in A/m.
 
-    Each is that of one standard deviation of the study's prior of magnetizations. The blocks of a
-    neighbour are others than this magnet's, and were not measured.
+    They are Mx, My and Mz of the blocks of every neighbour, along the axes of this magnet before it
+    is moved there. These blocks are others than this magnet's, and were not measured.
     """
     settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
-    if not neighbours:
-        return []
     root = sparse.csr_array(root_matrix(nominal_prior(
-        magnet.nominal_magnetization, 3, settings.magnitude_sd, settings.direction_sd_deg,
-        settings.common_mode_sd).root)).toarray().reshape(len(magnet.blocks), 3, -1)
-    own = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks]) @ root
+        magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
+        settings.direction_sd_deg, settings.common_mode_sd).root))
+    return Gaussian(np.zeros(neighbour_parameters(magnet)), stacked_root(
+        sparse.csr_array(sparse.kron(sparse.eye_array(len(neighbours)), root))))
+
+
+def neighbour_parameters(magnet: Magnet) -> int:
+    """Return the number of parameters of the `neighbour_prior`."""
+    return len(magnet.study.external.neighbours) * len(magnet.nominal_magnetization)
+
+
+def with_neighbours(magnet: Magnet, distribution: Gaussian) -> Gaussian:
+    """Return a distribution of a magnet's parameters with those of neighbours' blocks beside.
+
+    They are distributed as in the `neighbour_prior` unless they are known.
+    """
+    count, beside = neighbour_parameters(magnet), distribution.beside
+    if count == (0 if beside is None else len(beside.mean)):
+        return distribution
+    alone = replace(distribution, beside=None)
+    return alone.with_beside(neighbour_prior(magnet)) if count else alone
+
+
+def neighbour_remanences(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
+    """Return the blocks of each neighbour, and the matrices (blocks, 3, 3) from what their
+    magnetizations deviate in A/m, see `neighbour_prior`, to T of remanence.
+    """
+    own = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks])
     return [(neighbour_blocks(magnet.blocks, (one,)),
-             one.factor * rotation_about_z(np.radians(one.turn_deg)) @ own) for one in neighbours]
+             one.factor * rotation_about_z(np.radians(one.turn_deg)) @ own)
+            for one in magnet.study.external.neighbours]
 
 
-def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
-    """Return the fields (k, n, 3) in T of all `neighbour_modes` at points (n, 3) in m."""
-    found = [np.zeros((*points.shape, 0))]
-    for blocks, modes in neighbour_modes(magnet):
-        own = np.zeros((*points.shape, modes.shape[2]))
-        for unit, mode in zip(unit_fields(blocks, points), modes, strict=True):
-            own += unit @ mode
-        found.append(own)
-    return np.moveaxis(np.concatenate(found, axis=2), -1, 0)
+def neighbour_columns(magnet: Magnet, points: Floats) -> Floats:
+    """Return B (n, 3, parameters) in T at points (n, 3) in m per A/m of the parameters of
+    `neighbour_prior`.
+    """
+    return np.concatenate([np.zeros((*points.shape, 0)), *(
+        unit @ matrix for blocks, matrices in neighbour_remanences(magnet)
+        for unit, matrix in zip(unit_fields(blocks, points), matrices, strict=True))], axis=2)
 
 
 def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
@@ -364,7 +385,7 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
                       "nominal ones than if none were magnetized, by "
                       f"{off / np.linalg.norm(nominal):.0%} of these. Is it of another magnet?",
                       HalbachWarning, stacklevel=2)
-    return magnetized(magnet, distribution, name)
+    return magnetized(magnet, with_neighbours(magnet, distribution), name)
 
 
 def nominal_parameters(magnet: Magnet) -> Floats:

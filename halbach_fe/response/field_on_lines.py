@@ -35,7 +35,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
-from halbach_fe.response.block_variation import neighbour_deviations
+from halbach_fe.response.block_variation import neighbour_columns
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
@@ -273,18 +273,16 @@ OF_LINES = "--from-m and --to-m"
 
 def field_on_lines(
     magnet: Magnet, lines: Lines, magnetizations: Gaussian, session: Session,
-    inside: bool = False, before: bool = False
+    inside: bool = False
 ) -> FieldOnLines:
     """Return B on lines for normally distributed magnetizations in A/m.
 
     Parameters
     ----------
     magnetizations : Gaussian
-        Of all parameters of the response matrix.
+        Of all parameters of the response matrix, with those of neighbours' blocks beside.
     inside : bool
         Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
-    before : bool
-        Whether this is before a map was read: then the blocks of neighbours deviate, too.
 
     Raises
     ------
@@ -314,11 +312,9 @@ def field_on_lines(
                                 model.whole @ magnetizations.root]).reshape(len(points), 3, -1)
         error = weak = model.error
         polarization = np.zeros((lines.points[..., 0].size, 3, flux.shape[2]))
-    if before:
-        others = np.moveaxis(neighbour_deviations(magnet, points), 0, -1)
-        flux = np.concatenate([flux, others], axis=2)
-        polarization = np.concatenate([
-            polarization, np.zeros((*polarization.shape[:2], others.shape[2]))], axis=2)
+    if (others := magnetizations.beside) is not None:
+        flux = flux + neighbour_columns(magnet, points) @ np.column_stack(
+            [others.mean, np.asarray(others.root)])
     shape = lines.points.shape
     every, bars = (each.reshape(-1, *shape[1:], *each.shape[2:]) for each in (
         flux, error.reshape(-1, 3)))

@@ -28,7 +28,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import observe
-from halbach_fe.response.block_variation import neighbour_deviations
+from halbach_fe.response.block_variation import neighbour_columns
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.region import SHOWN_DEGREES, Region, Sampling, region_points, sphere_points
 from halbach_fe.solver.session import Session
@@ -131,8 +131,8 @@ class HomogeneityModel:
     degrees: int
     """Largest degree of the harmonics."""
     of_neighbours: Floats
-    """B of what neighbours' blocks deviate by independent modes, of one standard deviation of the
-    prior each, at the region's points. Shape (n, 3, modes), in T."""
+    """Of the same for what the magnetizations of neighbours' blocks deviate, which a distribution
+    knows beside its parameters. Shape (3 m, neighbours' parameters), in T m/A."""
 
     @property
     def weights(self) -> Floats:
@@ -152,32 +152,35 @@ class HomogeneityModel:
         return PPM * rms(self.response.error) / mean
 
     def of(
-        self, parameters: Gaussian, seed: int = 0, measured: bool = False, before: bool = False
+        self, parameters: Gaussian, seed: int = 0, measured: bool = False
     ) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.
 
-        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`, ``before``
-        as in `drawn`.
+        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`.
         """
-        mean = self.field(parameters.mean[:, None])[..., 0]
+        mean = self.field(parameters.stacked.mean[:, None])[..., 0]
         return self.of_fields(
-            mean, self.drawn(parameters, DRAWS, np.random.default_rng(seed), before), measured)
+            mean, self.drawn(parameters, DRAWS, np.random.default_rng(seed)), measured)
 
     def drawn(
-        self, parameters: Gaussian, count: int, generator: np.random.Generator, before: bool
+        self, parameters: Gaussian, count: int, generator: np.random.Generator
     ) -> Floats:
-        """Return B (n, 3, count) in T at the region's points of magnets that are drawn.
-
-        ``before`` a map was read nobody knows what the blocks of neighbours deviate.
-        """
-        found = self.field(parameters.sample(count, generator).T)
-        return found + self.of_neighbours @ generator.standard_normal(
-            (self.of_neighbours.shape[2], count)) if before else found
+        """Return B (n, 3, count) in T at the region's points of magnets that are drawn."""
+        return self.field(parameters.stacked.sample(count, generator).T)
 
     def field(self, magnetizations: Floats) -> Floats:
-        """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d)."""
-        rows = slice(0, 3 * len(self.weights))
-        values = self.response.matrix[rows] @ magnetizations
+        """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d).
+
+        Those of neighbours' blocks may follow.
+        """
+        return self._field(magnetizations, slice(0, 3 * len(self.weights)))
+
+    def _field(self, magnetizations: Floats, rows: slice) -> Floats:
+        """Return `field` at the points of some rows of the response."""
+        own, others = np.split(magnetizations, [len(self.response.nominal)])
+        values = self.response.matrix[rows] @ own
+        if len(others):
+            values = values + self.of_neighbours[rows] @ others
         return np.asarray(self.response.offset[rows, None] + values).reshape(
             -1, 3, magnetizations.shape[1])
 
@@ -205,12 +208,11 @@ class HomogeneityModel:
             *ranges,
             self._harmonics(field, drawn, direction, float(size[0]), sizes))
 
-    def slices(self, mean: Floats) -> list[Slice]:
-        """Return |B| in three planes for magnetizations (parameters,) in A/m."""
+    def slices(self, parameters: Gaussian) -> list[Slice]:
+        """Return |B| in three planes for the mean of a distribution of the magnetizations."""
         size = np.full(len(self.in_air), np.nan)
-        rows = slice(3 * len(self.weights), None)
-        field = self.response.offset[rows] + self.response.matrix[rows] @ mean
-        size[self.in_air] = np.linalg.norm(field.reshape(-1, 3), axis=1)
+        field = self._field(parameters.stacked.mean[:, None], slice(3 * len(self.weights), None))
+        size[self.in_air] = np.linalg.norm(field[..., 0], axis=1)
         return slices_of(self.region, size)
 
     def deviations(
@@ -391,8 +393,8 @@ def homogeneity_model(
     every = np.vstack([sampling.points, planes[in_air]])
     observation = observe(bare.study, every, np.ones(every.shape, bool))
     return HomogeneityModel(region, every, sampling, in_air,
-                            response_matrix(bare, observation, session), degrees, np.moveaxis(
-                                neighbour_deviations(magnet, sampling.points), 0, -1))
+                            response_matrix(bare, observation, session), degrees,
+                            neighbour_columns(magnet, every).reshape(3 * len(every), -1))
 
 
 def slice_points(region: Region) -> Floats:

@@ -33,7 +33,12 @@ from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import flux_density_at
-from halbach_fe.response.block_variation import Deviations, distribution_of, with_magnetizations
+from halbach_fe.response.block_variation import (
+    Deviations,
+    distribution_of,
+    neighbour_columns,
+    with_magnetizations,
+)
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
 from halbach_fe.solver.routes import solve_nominal
@@ -100,7 +105,7 @@ def magnetic_axis(
     MagneticAxis or None
         None if the nominal magnet has no main multipole, or the middle of the bore is not free.
     """
-    distribution_of(magnet, magnetizations, "magnetizations")
+    magnetizations = distribution_of(magnet, magnetizations, "magnetizations").stacked
     flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius
     radius = RADIUS * bore
     reach = 0.0 if flat else LENGTH * magnet.array_half_length
@@ -172,19 +177,23 @@ def _fields(
     """Return B at points (n, 3) in m with the magnetizations ``mean`` in A/m, and with the nominal
     ones, (n, 3) in T, and the derivative (n, 3, parameters) of the former.
     """
-    own = session.within("axis")
+    own, others = session.within("axis"), neighbour_columns(magnet, points)
     if magnet.is_nonlinear:
         uniform = mean[:len(magnet.parameter_names)]
         updated = Magnet(magnet.study, with_magnetizations(magnet, uniform))
         nominal = solve_nominal(magnet, points, own.within("nominal"))
         field = solve_nominal(updated, points, own.within("updated"))
         columns = Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
-        inside = columns[..., len(uniform):] @ mean[len(uniform):]  # variations inside blocks
-        return field + inside, nominal, columns
+        columns = np.concatenate([columns, others], axis=2)
+        # variations inside blocks, and neighbours' blocks
+        beside = columns[..., len(uniform):] @ mean[len(uniform):]
+        return field + beside, nominal, columns
     response = response_matrix(magnet, flux_density_at(points), own)
     columns, external = (values.reshape(len(points), 3, *values.shape[1:])
                          for values in (response.whole, response.offset))
-    return columns @ mean + external, columns @ response.nominal + external, columns
+    nominal = columns @ response.nominal + external
+    columns = np.concatenate([columns, others], axis=2)
+    return columns @ mean + external, nominal, columns
 
 
 _ON_SPHERE = np.array([np.array(place) / np.linalg.norm(place)

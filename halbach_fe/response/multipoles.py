@@ -42,8 +42,8 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import (
     Deviations,
     changes_by_amplitudes,
-    neighbour_deviations,
-    neighbour_modes,
+    neighbour_columns,
+    neighbour_remanences,
 )
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
@@ -221,8 +221,8 @@ class MultipoleModel:
     left_out_T: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Uniform field that the integral along z, which would be infinite, is without."""
     of_neighbours: Complexes | None = None
-    """Multipoles of what neighbours' blocks deviate by independent modes, of one standard deviation
-    of the prior each. Shape (1 + k, modes), in T (integrated: T m)."""
+    """Rows for what the magnetizations of neighbours' blocks deviate, which a distribution knows
+    beside its parameters. Shape (1 + k, neighbours' parameters), in T m/A (integrated: T m^2/A)."""
 
     @property
     def unit(self) -> str:
@@ -238,21 +238,10 @@ class MultipoleModel:
         """Return the matrix (2 k, parameters) from magnetizations to b_n, a_n for a given |C_N|."""
         return UNITS / main * np.vstack([self.matrix[1:].real, self.matrix[1:].imag])
 
-    def of(self, parameters: Gaussian, before: bool = False) -> Multipoles:
-        """Return the multipoles of normally distributed magnetizations in A/m; ``before`` as in
-        `root_of`.
-        """
-        return self.known(self.offset + self.matrix @ parameters.mean,
-                          self.root_of(parameters, before))
-
-    def root_of(self, parameters: Gaussian, before: bool) -> Complexes:
-        """Return a root (1 + k, q) of the covariance of C.
-
-        ``before`` a map was read nobody knows what the blocks of neighbours deviate.
-        """
-        root = self.matrix @ parameters.root
-        return np.hstack([root, self.of_neighbours]) if (
-            before and self.of_neighbours is not None) else root
+    def of(self, parameters: Gaussian) -> Multipoles:
+        """Return the multipoles of normally distributed magnetizations in A/m."""
+        mean, root = parameters.products(self.matrix, self.of_neighbours)
+        return self.known(self.offset + mean, root)
 
     def known(self, mean: Complexes, root: Complexes) -> Multipoles:
         """Return the multipoles for a mean (1 + k,) of C and a root (1 + k, q) of its covariance.
@@ -356,13 +345,22 @@ def multipole_models(
 def _of_neighbours(
     magnet: Magnet, observation: Observation, radius: float, integrated: bool
 ) -> Complexes:
-    """Return C_n (K, modes) of `neighbour_modes`, in T, or in T m if integrated along all of z."""
+    """Return C_n (K, parameters) of the `neighbour_prior` in T m/A, or in T m^2/A if integrated
+    along all of z.
+    """
     if not integrated:
-        return _complexes(observation.apply(neighbour_deviations(magnet, observation.points)).T)
+        return _complexes(_of_neighbours_read(magnet, observation))
     highest = observation.operator.shape[0] // 4  # rows of the field near the magnet, and beyond
     return np.hstack([np.zeros((highest, 0)), *(
-        np.einsum("bk,bm->km", _integrals_of_shapes(blocks, radius, highest)[0],
-                  modes[:, 0] + 1j * modes[:, 1]) for blocks, modes in neighbour_modes(magnet))])
+        np.einsum("bk,bm->kbm", _integrals_of_shapes(blocks, radius, highest)[0],
+                  matrices[:, 0] + 1j * matrices[:, 1]).reshape(highest, -1)
+        for blocks, matrices in neighbour_remanences(magnet))])
+
+
+def _of_neighbours_read(magnet: Magnet, observation: Observation) -> Floats:
+    """Return readings (n, parameters) in T per A/m of the `neighbour_prior`."""
+    columns = neighbour_columns(magnet, observation.points)
+    return observation.apply(np.moveaxis(columns, -1, 0)).T
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
@@ -441,7 +439,7 @@ def circle_models(
     nominal magnet.
     """
     main, models = magnet.array.multipole_order, []
-    deviations = Deviations.of(magnet)
+    deviations, neighbours = Deviations.of(magnet), _of_neighbours_read(magnet, observation)
     circles = [(radius, z, analysis) for radius, z, analysis in _read_circles(magnet, observation)
                if not _source_within(magnet, radius, z)]
     for radius in sorted({radius for radius, _, _ in circles}):
@@ -452,12 +450,15 @@ def circle_models(
             continue
         by_z: dict[float, Complexes] = {}
         offsets: dict[float, Complexes] = {}
+        beside: dict[float, Complexes] = {}
         for z, analysis in own:
-            mistaken, of_others = _aliases(
+            mistaken, of_others, of_neighbours = _aliases(
                 deviations, observation, radius, z, analysis.shape[0] // 2, whole)
             by_z[z] = _complexes(_seen(analysis, model.matrix)) - mistaken
             offsets[z] = _complexes(_seen(analysis, model.offset)) - of_others
-        reference, fixed = (each[min(by_z, key=abs)][main - 1:main] for each in (by_z, offsets))
+            beside[z] = _complexes(_seen(analysis, neighbours)) - of_neighbours
+        reference, fixed, others = (each[min(by_z, key=abs)][main - 1:main]
+                                    for each in (by_z, offsets, beside))
         try:
             # between the poles of an undulator 0.5 % of the largest were left of mesh and columns
             least = 0.03 * max(abs(row[main - 1] @ model.nominal) for row in by_z.values())
@@ -468,12 +469,13 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix, offset = by_z[z][:len(orders)], offsets[z][:len(orders)]
+            matrix, offset, rest = (each[z][:len(orders)] for each in (by_z, offsets, beside))
             models.append(MultipoleModel(
                 orders, main, radius, z if magnet.dimension == 3 else None, False,
                 phases[:, None] * np.vstack([reference, matrix]),
                 phases * np.concatenate([fixed, offset]),
-                _circle_error(analysis, model.error)[order - 1], model.nominal, -turn))
+                _circle_error(analysis, model.error)[order - 1], model.nominal, -turn,
+                of_neighbours=phases[:, None] * np.vstack([others, rest])))
     return models
 
 
@@ -508,12 +510,13 @@ def solved_circles(
 def _aliases(
     deviations: Deviations, observation: Observation, radius: float, z: float, orders: int,
     whole: bool,
-) -> tuple[Complexes, Complexes]:
+) -> tuple[Complexes, Complexes, Complexes]:
     """Return what the angles of a circle mistake for its orders 1 ... K, in vacuum.
 
     The first result is (K, parameters) in T per parameter, the second that of external fields (K,)
-    in T; of the ``whole`` nominal magnet it is (K, 1) with external fields, and zero. It is the
-    difference of the sums over the circle's own angles and over a multiple of them.
+    in T; of the ``whole`` nominal magnet it is (K, 1) with external fields, and zero. The third is
+    that of the `neighbour_prior`, in T m/A. It is the difference of the sums over the circle's own
+    angles and over a multiple of them.
     """
     magnet, points = deviations.magnet, observation.map_points
     # relative difference of radii up to which points are on one circle, and angle in rad up to
@@ -539,10 +542,12 @@ def _aliases(
         nominal = np.zeros(columns.shape[2])
         nominal[:len(magnet.nominal_magnetization)] = magnet.nominal_magnetization
         columns, others = (columns @ nominal)[..., None] + others, 0 * others
-    radial = np.einsum("ni,nip->np", direction, np.concatenate([columns, others], axis=2))
+    radial = np.einsum("ni,nip->np", direction, np.concatenate(
+        [columns, others, neighbour_columns(magnet, places)], axis=2))
     wave = np.exp(-1j * np.outer(np.arange(1, orders + 1), angle)) * 2j  # B_n + i A_n
     found = wave[:, ::times] @ radial[::times] / own - wave @ radial / len(angle)
-    return found[:, :-1], found[:, -1]
+    own = columns.shape[2]
+    return found[:, :own], found[:, own], found[:, own + 1:]
 
 
 def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:

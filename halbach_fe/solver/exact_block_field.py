@@ -416,6 +416,19 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
     return field
 
 
+def external_gradient(magnet: Magnet, points: Floats) -> Floats:
+    """Return the gradient of `external_field`, (n, 3, 3) in T/m, by central differences.
+
+    Element ``[i, c, j]`` is the derivative of component c along direction j.
+    """
+    external = magnet.external
+    if not (external.neighbours or external.dipoles or external.coils):
+        return np.zeros((len(points), 3, 3))
+    step = 1e-4 * np.eye(3)  # in m, small beside the distance of any source
+    return np.stack([external_field(magnet, points + one) - external_field(magnet, points - one)
+                     for one in step], axis=2) / 2e-4
+
+
 def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Floats:
     """Return B (n, 3) in T of a second magnet of the study's blocks, shifted along z and turned.
 

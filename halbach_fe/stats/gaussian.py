@@ -11,7 +11,7 @@ factor. Whitening by ``W = L^-1``, so that ``W Sigma W' = I``, is cheap.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -111,6 +111,50 @@ class Gaussian:
     root: Floats | CovarianceFactor
     """Covariance = root @ root.T, with any k. For both types ``matrix @ root`` and ``root @
     values`` are arrays, and ``np.asarray(root)`` is the root as a dense array. Shape (m, k)."""
+    beside: Gaussian | None = None
+    """Other parameters (b,) that are known together with these, such as those of the blocks of
+    neighbours: the columns of its root (b, k) belong to the same independent variables."""
+
+    @property
+    def stacked(self) -> Gaussian:
+        """All parameters (m + b,): these, followed by those beside."""
+        if self.beside is None:
+            return self
+        mean, root, other = np.append(self.mean, self.beside.mean), self.root, self.beside.root
+        if not (isinstance(root, CovarianceFactor) and isinstance(other, CovarianceFactor)):
+            return Gaussian(mean, np.vstack([np.asarray(root), np.asarray(other)]))
+        return Gaussian(mean, replace(root, outer=sparse.csr_array(sparse.vstack(
+            [sparse.csr_array(root.outer), sparse.csr_array(other.outer)]))))
+
+    def split(self, count: int, beside: int) -> Gaussian:
+        """Return the first ``count`` parameters, with so many beside that follow them."""
+        def part(rows: slice) -> Gaussian:
+            root = self.root
+            return Gaussian(self.mean[rows], replace(root, outer=root.outer[rows])
+                            if isinstance(root, CovarianceFactor) else root[rows])
+
+        return replace(part(slice(count)), beside=part(
+            slice(count, count + beside)) if beside else None)
+
+    def with_beside(self, other: Gaussian) -> Gaussian:
+        """Return these parameters with others beside, which are independent of them."""
+        root = self.root if isinstance(self.root, CovarianceFactor) else stacked_root(self.root)
+        outer = sparse.block_diag([sparse.csr_array(root.outer),
+                                   sparse.csr_array(root_matrix(other.root))], format="csr")
+        directions = np.vstack([
+            root.directions, np.zeros((other.root.shape[1], len(root.remaining)))])
+        return Gaussian(np.append(self.mean, other.mean), CovarianceFactor(
+            sparse.csr_array(outer), directions, root.remaining)).split(
+                len(self.mean), len(other.mean))
+
+    def products(self, matrix: Numbers, of_beside: Numbers | None) -> tuple[Numbers, Numbers]:
+        """Return mean (n,) and root (n, k) of the products of a matrix (n, m) with these parameters
+        and of another (n, b) with those beside, if both are known.
+        """
+        mean, root = matrix @ self.mean, matrix @ self.root
+        if self.beside is None or of_beside is None:
+            return mean, root
+        return mean + of_beside @ self.beside.mean, root + of_beside @ self.beside.root
 
     @property
     def covariance(self) -> Floats:
@@ -212,7 +256,11 @@ def stacked_root(*roots: Floats | sparse.csr_array | CovarianceFactor) -> Covari
 def with_independent(prior: Gaussian, mean: Floats, sd: Floats) -> Gaussian:
     """Return a distribution of the same parameters and, after them, of independent ones (k,)."""
     root = sparse.block_diag([sparse.csr_array(root_matrix(prior.root)), sparse.diags_array(sd)])
-    return Gaussian(np.concatenate([prior.mean, mean]), stacked_root(root))
+    other = prior.beside
+    return Gaussian(
+        np.concatenate([prior.mean, mean]), stacked_root(root),
+        None if other is None else Gaussian(other.mean, stacked_root(
+            other.root, sparse.csr_array((len(other.mean), len(sd))))))
 
 
 def root_matrix(root: Floats | sparse.csr_array | CovarianceFactor) -> Floats | sparse.csr_array:

@@ -259,7 +259,8 @@ class NoiseSettings(StudyModel):
 
     ``regions`` give the standard deviation of a reading; a map with a sigma of its own replaces
     them. ``position_sd_m`` is the standard deviation of every point's position along x, y and z of
-    the stage (a single value holds for all three). The position uncertainty adds to the noise of
+    the stage, which are columns of a file as ``instrument.position_axes`` names them (a single
+    value holds for all three). The position uncertainty adds to the noise of
     both: it changes the readings of a point by the local gradient of the field, all components of
     the point together, which is much in the fringe field and little in the homogeneous field.
     """

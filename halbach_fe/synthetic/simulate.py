@@ -256,8 +256,8 @@ def measured(
     """Return the recorded points and readings without noise, both (n, 3); of |B|, (n, 1).
 
     The ``points`` of the map come first, the held-out points ``others`` last. ``offsets`` (n, 3) in
-    m displace the probe from each of them. The ``stated`` instrument, which the study describes,
-    has these faults too; its units and axes are not those of the result.
+    m, along the axes of the stage, displace the probe from each of them. The ``stated`` instrument,
+    which the study describes, has these faults too; its units and axes are not those of the result.
     """
     nominal = np.vstack([points, others])
     maps = [part for part in (points, others) if len(part)]
@@ -265,8 +265,8 @@ def measured(
     if stated != IDEAL:
         places = places + np.concatenate(
             [stated_places(stated, part) - part for part in maps], axis=1)
-    if offsets is not None:
-        places = places + offsets  # the same for all sensors
+    if offsets is not None:  # the same for all sensors
+        places = places + Rotation.from_rotvec(stated.rotation_rad).apply(offsets)
     # the three sensors are usually in one place, whose field is then computed once
     distinct, inverse = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
     check_air(magnet, distinct)

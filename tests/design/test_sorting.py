@@ -7,13 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.design.sorting import sort_blocks
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.blocks import rotation_about_z
+from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
+from halbach_fe.magnets import halbach_ring
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.report.sorting import answer
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import coil_table, draw_magnet
@@ -202,3 +206,33 @@ def test_the_seed_decides(session):
     assert one.table.places == same.table.places
     np.testing.assert_array_equal(one.random, same.random)
     assert (one.random != other.random).any()
+
+
+@pytest.mark.parametrize("region", [None, {"sphere_m": 0.01}])
+def test_sorted_magnets_have_the_bars_of_neighbours_blocks(region):
+    """Strengths of single blocks change the field by as much of each block's. The bars were those
+    of the magnet's own blocks alone, which were measured to 1e-5.
+    """
+    strength_sd = 0.02
+    magnet = halbach_ring(
+        blocks=8, inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.04, remanence_T=1.2).with_(
+            external={"neighbours": [{"z_m": 0.06}, {"z_m": -0.07}]}, homogeneity=region,
+            prior={"magnitude_sd": strength_sd, "direction_sd_deg": 1e-9})
+    size = magnet.blocks[0].volume * 1.2 / (4e-7 * np.pi)
+    rows = np.arange(8)
+    moment = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ block.easy_axis
+                       for block in magnet.blocks]) * size
+    table = BlockTable(tuple(f"S{row}" for row in rows), ("",) * 8, np.ones(8, int), rows + 1,
+                       moment, np.full(8, 1e-5 * size), np.full(8, np.nan), np.full(8, np.nan))
+    reference = None if region else MultipoleReference(0.001, (2, 3), 0.0)
+    with pytest.warns(HalbachWarning, match="nothing to sort"):
+        found = hf.sort(magnet, table, Session.temporary(), reference)
+    middle = np.zeros((1, 3))
+    along = magnet.field_T(middle)[0] / np.linalg.norm(magnet.field_T(middle)[0])
+    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
+    expected = strength_sd * np.linalg.norm(
+        [along @ field_of([block], middle)[0] for block in others])
+    bars = [found.best.main_sd, found.numbered.main_sd]
+    if region:  # whose mean is the field in the middle, by some hundred draws
+        np.testing.assert_allclose([one.mean_sd_T for one in found.fields], expected, rtol=0.2)
+    np.testing.assert_allclose(bars, expected, rtol=0.01)  # of a sphere or circle, not its middle

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import OutputError, SamplingError
+from halbach_fe.core.errors import OutputError, SamplingError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import mcmc
 from halbach_fe.inference.infer import infer
@@ -255,6 +255,17 @@ sigma_T = 1e-4
                  str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--samples", "10"])
     assert code == 3
     assert "closed form" in capsys.readouterr().err
+
+
+def test_chains_beside_neighbours_are_refused():
+    """Their blocks deviate too, which an update without chains estimates and the chains do not."""
+    table = tomllib.loads(STUDY_FILE)
+    table |= {"dimension": 3, "array": table["array"] | {"ring_length_m": 0.1},
+              "iron_ring": table["iron_ring"] | {"length_m": 0.1}}
+    mcmc.check_sampling(build_magnet(parse_study(table)))  # the control
+    with pytest.raises(StudyError, match=r"external\.neighbours.*Leave --samples out"):
+        mcmc.check_sampling(build_magnet(parse_study(table | {
+            "external": {"neighbours": [{"z_m": 0.3}]}})))
 
 
 @pytest.mark.parametrize("small_disk", [64], indirect=True)

@@ -17,7 +17,7 @@ from halbach_fe.diagnosis.summary import main_field_T
 from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import PREDICTION_COLUMNS
-from halbach_fe.inference.storage import inference_summary
+from halbach_fe.inference.storage import inference_summary, read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.response.multipoles import circle_models
@@ -185,6 +185,113 @@ def test_what_blocks_of_neighbours_deviate_is_field(generator):
         points, true + 1e-5 * generator.standard_normal(true.shape))).field
     off = np.sum(field_of(blocks, field.places) * field.along, axis=1) - field.mean
     assert np.sqrt(np.mean((off / field.sd)**2)) < 3
+
+
+NEIGHBOUR = {"z_m": 0.08, "turn_deg": 40.0}
+"""It begins 20 mm beyond the end of the magnet."""
+REFERENCE = hf.MultipoleReference(0.01, (2, 3, 4), 0.02)
+
+
+@pytest.fixture(scope="module")
+def beside_a_neighbour(tmp_path_factory):
+    """Magnets beside others, all with errors of their own, and their updates: fields of magpylib,
+    read on circles.
+    """
+    angle, heights = 2 * np.pi * np.arange(12) / 12, np.linspace(-0.03, 0.03, 13)
+    circle = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    points = (circle + heights[:, None, None] * np.array([0, 0, 1.0])).reshape(-1, 3)
+    observed = {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": 0.01, "angles": 12, "z_min_m": -0.03, "z_max_m": 0.03,
+        "count": 13}}
+    found = []
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        own, other = truth(generator), truth(generator)
+        other.rotate_from_angax(NEIGHBOUR["turn_deg"], "z", anchor=0)
+        other.move((0, 0, NEIGHBOUR["z_m"]))
+
+        def field(points, own=own, other=other):
+            return own.getB(points) + other.getB(points)
+
+        data = field_map(points, field(points) + NOISE_T * generator.standard_normal(points.shape))
+        found.append((field, updated(
+            tmp_path_factory.mktemp("update"), data, observation=observed, inference={},
+            external={"neighbours": [NEIGHBOUR]})))
+    return found
+
+
+def true_multipoles(field, turn):
+    """C_1 to C_4 in T on the circle of `REFERENCE`, in axes turned by an angle about z."""
+    angle = 2 * np.pi * np.arange(32) / 32
+    radial = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    shown = np.sum(field(REFERENCE.radius_m * radial + [0, 0, REFERENCE.z_m]) * radial, axis=1)
+    order = np.arange(1, 5)[:, None]
+    return 2j / 32 * np.exp(-1j * order * (angle - turn)) @ shown
+
+
+def rms_pull(off, sd):
+    return np.sqrt(np.mean((np.concatenate(off) / np.concatenate(sd))**2))
+
+
+def test_an_update_knows_its_neighbours_blocks(beside_a_neighbour):
+    """Multipoles, fields on a line, mean field and roll are off by some of their bars. They were
+    those of nominal neighbours, without a bar: 2.5, 16, 2.8 and 7.5 bars off (rms).
+    """
+    line = hf.Lines((0.005, 0, -0.03), (0.005, 0, 0.03), count=13)
+    region = hf.Region.sphere(0.008)
+    off, sd = ({"multipoles": [], "line": [], "mean": [], "roll": []} for _ in range(2))
+    for field, result in beside_a_neighbour:
+        session = Session.temporary()
+        model, known = hf.multipoles(
+            result.magnet, session.within("m"), REFERENCE, result).tables[-1]
+        true = true_multipoles(field, model.turn)
+        on_line = hf.field(result.magnet, line, session.within("l"), result)
+        mean = hf.homogeneity(result.magnet, session.within("h"), region, result)
+        inner = mean.model.sampling.points
+        true_mean = mean.model.weights @ np.linalg.norm(field(inner), axis=1)
+        mean, known = mean.by_name["posterior"], known["posterior"]
+        for name, one, other, bar in (
+                ("multipoles", known.mean, model.units(true), known.sd),
+                ("line", on_line.mean.ravel(), field(line.points.reshape(-1, 3)).ravel(),
+                 on_line.sd.ravel()),
+                ("mean", [mean.mean_T], true_mean, [mean.mean_sd_T]),
+                ("roll", [known.roll], -np.angle(true[0]), [known.roll_sd])):
+            off[name].append(np.asarray(one) - other)
+            sd[name].append(bar)
+    for name in off:  # of 4 numbers, which have an rms above 2 with a probability of 0.3 %
+        assert rms_pull(off[name], sd[name]) < 2, name
+
+
+def test_what_an_update_knows_of_neighbours_is_everywhere(beside_a_neighbour, tmp_path):
+    """Shims, the tables of circles and files have the same multipoles. A file without neighbours'
+    blocks, as earlier versions wrote, says so, and its bars are those of unknown neighbours.
+    """
+    _, result = beside_a_neighbour[0]
+    magnet, session = result.magnet, Session.temporary()
+
+    def known(posterior):
+        return hf.multipoles(magnet, session, REFERENCE, posterior).tables[-1][1]["posterior"]
+
+    exact = known(result)
+    np.testing.assert_allclose(hf.shim(
+        result, session, REFERENCE, swaps=0, turns=0).before.mean, exact.mean, atol=1e-9)
+    circle = next(one for one in circle_models(
+        magnet, result.observation, result.response) if one.z == pytest.approx(0.02))
+    same = circle.of(result.posterior)
+    rows = [circle.orders.index(order) for order in REFERENCE.orders]
+    np.testing.assert_allclose(  # in axes of another turn about z, and of another main one
+        same.main * same.sizes[rows], exact.main * exact.sizes, rtol=1e-6)
+    write_inference(result, tmp_path)
+    stored = read_posterior(magnet, tmp_path / "posterior.h5")
+    assert not stored.disagreement
+    np.testing.assert_allclose(known(stored).mean, exact.mean, atol=1e-9)
+    np.testing.assert_allclose(known(stored).sd, exact.sd, rtol=1e-9)
+    write_inference(replace(result, prior=replace(result.prior, beside=None), posterior=replace(
+        result.posterior, beside=None)), tmp_path)
+    earlier = read_posterior(magnet, tmp_path / "posterior.h5")
+    assert "neighbours' blocks" in earlier.disagreement
+    assert (known(earlier).sd > exact.sd).all()
+    assert known(earlier).main_sd > 10 * exact.main_sd
 
 
 def test_circles_that_the_mapper_has_moved_are_none_of_the_magnet(generator, tmp_path):

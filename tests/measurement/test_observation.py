@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
+from types import SimpleNamespace
+
+import magpylib
 import numpy as np
 import pytest
 
@@ -18,9 +22,12 @@ from halbach_fe.measurement.observation import (
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.faulty_instrument import stated_places
 from halbach_fe.synthetic.simulate import real_places
 from tests.conftest import changed, circle
+from tests.support.short_dipole import TEXT as SHORT
+from tests.support.short_dipole import truth as short_dipole_truth
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
            "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}}
@@ -230,6 +237,50 @@ def test_positions_scatter_along_the_axes_of_the_stage(short_dipole, generator):
     turned = np.kron(np.eye(12), turn.T)
     other = turned @ along_magnet.covariance.toarray() @ turned.T
     assert np.abs((other - covariance) / scale).max() > 0.5
+
+
+def loops(radius_m, z_m, side_m, ampere_turns):
+    """A coil of a square section by magpylib, as 5 x 5 loops."""
+    places = side_m * np.linspace(-0.4, 0.4, 5)
+    return magpylib.Collection(*(magpylib.current.Circle(
+        current=ampere_turns / 25, diameter=2 * (radius_m + across), position=(0, 0, z_m + along))
+        for across in places for along in places))
+
+
+COIL = {"kind": "round", "current_A": 5.0, "turns": 1000, "radius_m": 0.06, "centre_m": [0, 0, 0.1],
+        "section_m": [0.004, 0.004]}
+
+
+@pytest.mark.parametrize("external", [
+    {"neighbours": [{"z_m": 0.085}]}, {"coils": [COIL]},
+    {"dipoles": [{"position_m": [0.0, 0.0, 0.1], "moment_A_m2": [3.0, 0.0, 30.0]}]}])
+def test_noise_of_positions_in_the_gradient_of_external_sources(external):
+    """By differences of magpylib's field. The noise was that of the magnet's blocks alone, which is
+    the control.
+    """
+    exact = SimpleNamespace(standard_normal=lambda: 0.0)  # blocks without errors
+    sources = [short_dipole_truth(exact)]
+    if "neighbours" in external:
+        sources.append(short_dipole_truth(exact).move((0, 0, 0.085)))
+    if "coils" in external:
+        sources.append(loops(0.06, 0.1, 0.004, 5000.0))
+    if "dipoles" in external:
+        sources.append(magpylib.misc.Dipole(
+            moment=(3.0, 0.0, 30.0), position=(0, 0, 0.1)))
+    points = np.array([[0.0, 0.0, 0.045], [0.005, 0.003, 0.05], [-0.004, 0.006, 0.04]])
+    sd, step = np.array([1e-4, 2e-4, 3e-4]), 1e-5
+    gradient = np.stack([sum(source.getB(points + step * axis) - source.getB(points - step * axis)
+                             for source in sources) / (2 * step) for axis in np.eye(3)], axis=2)
+    study = parse_study(tomllib.loads(SHORT) | {"external": external, "noise": {
+        "regions": [{"name": "all", "sigma_T": 1e-9}], "position_sd_m": sd.tolist()}})
+    noise = reading_noise(build_magnet(study), observe(study, points, np.ones((3, 3), bool)),
+                          field_map(points, np.ones((3, 3)))).sd.reshape(3, 3)
+    expected = np.linalg.norm(gradient * sd, axis=2)
+    # loops in place of a massive coil: 1e-4
+    np.testing.assert_allclose(noise, expected, rtol=1e-3, atol=1e-8)
+    alone = reading_noise(build_magnet(study.with_(external={})), observe(
+        study, points, np.ones((3, 3), bool)), field_map(points, np.ones((3, 3)))).sd.reshape(3, 3)
+    assert np.abs(alone / expected - 1).max() > 0.05
 
 
 def test_one_value_for_all_axes(short_dipole):

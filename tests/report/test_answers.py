@@ -913,11 +913,11 @@ def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     assert "the positions of the study, and the plan only orders them" in every
     assert "as many of the study's own positions" not in every
     assert "the first 1 " not in every
-    uncertain = replace(hf.plan(given.magnet, given.session),
-                        magnet=given.magnet.with_(instrument_sd={"gain": 0.02}))
-    assert "They take the instrument as exact" in plan.answer(uncertain).trust
-    assert "the instrument as exact" not in plan.answer(  # the control
-        replace(uncertain, magnet=given.magnet)).trust
+    open_terms = replace(hf.plan(given.magnet, given.session),
+                         magnet=given.magnet.with_(instrument_sd={"gain": 0.02}))
+    assert "instrument" not in plan.answer(open_terms).trust  # which is in the plan
+    assert "drift that [instrument_sd] leaves open is not in them" in plan.answer(replace(
+        open_terms, magnet=given.magnet.with_(instrument_sd={"drift_T": 1e-5}))).trust
     assert "tells little of the single blocks" not in every  # the control
     noisy = build_magnet(given.study.with_(noise={"regions": [{"name": "all", "sigma_T": 1.0}]}))
     vague = plan.answer(hf.plan(noisy, given.session)).said

@@ -14,7 +14,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.response.block_variation import Variations, neighbour_deviations
+from halbach_fe.response.block_variation import Variations, neighbour_columns, neighbour_prior
 from halbach_fe.response.homogeneity import DRAWS
 from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.session import Session
@@ -149,7 +149,8 @@ def test_neighbours_deviate_as_their_field_does(permeability):
         array__recoil_permeability=permeability, external={"neighbours": [{"z_m": 0.1}]},
         prior={"magnitude_sd": 1e-9, "direction_sd_deg": 1e-9, "common_mode_sd": 0.01})
     points = np.array([[0.0, 0.0, 0.03], [0.005, 0.0, 0.02]])
-    sd = np.linalg.norm(neighbour_deviations(magnet, points), axis=0)
+    root = np.asarray(neighbour_prior(magnet).root)
+    sd = np.linalg.norm(neighbour_columns(magnet, points) @ root, axis=2)
     np.testing.assert_allclose(sd, 0.01 * np.abs(external_field(magnet, points)), rtol=1e-6,
                                atol=1e-10)  # of the blocks by themselves: 2e-11
 
