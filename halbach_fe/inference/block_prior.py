@@ -195,7 +195,7 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     own[~own.any(axis=(1, 2))] = np.eye(size)  # of blocks that the magnet does not have
     gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
                               np.radians(magnet.study.prior.mounting_sd_deg),
-                              magnet.study.prior.common_mode_sd)
+                              magnet.study.prior.calibration_sd)
     types = _tested(members, intensities)
     odd = [samples.label for samples in types if not samples.normal]
     if odd and not placed:
@@ -278,7 +278,7 @@ def _mean_doubts(magnet: Magnet, members: dict[str, Floats]) -> list[str]:
     deviations = np.concatenate(list(members.values()))
     settings = magnet.study.prior
     mean = float(deviations[:, 0].mean())
-    sd = float(np.hypot(settings.magnitude_sd, settings.common_mode_sd))
+    sd = float(np.hypot(settings.magnitude_sd, settings.shared_sd))
     if abs(mean) <= MANY_SD * sd:
         return []
     side = "stronger" if mean > 0 else "weaker"
@@ -296,7 +296,7 @@ def _noise_doubts(magnet: Magnet, gaussian: Gaussian, nominal: Floats) -> list[s
     spoil what is known, and not only add nothing.
     """
     own, across = magnet.study.prior, magnet.dimension - 1
-    stated = float(np.linalg.norm((own.magnitude_sd, own.common_mode_sd,
+    stated = float(np.linalg.norm((own.magnitude_sd, own.shared_sd,
                                    *across * (np.radians(own.direction_sd_deg),))))
     known = float(np.sqrt(np.square(gaussian.sd).sum() / np.square(nominal).sum()))
     best = 1e-5  # of a moment: good coils repeat within some 1e-4, and are calibrated less well

@@ -547,7 +547,7 @@ def _contraction_in_words(result: InferenceResult, contraction: Floats) -> str:
         return "none: the prior leaves nothing open"
     low, high = (f"{100 * end:.0f}" for end in (contraction.min(), contraction.max()))
     share = f"{low} to {high}" if low != high else low
-    together = ("" if result.measured_blocks is None or not result.study.prior.common_mode_sd else
+    together = ("" if result.measured_blocks is None or not result.study.prior.calibration_sd else
                 "; a part of it is the calibration of the coil, which all measured blocks share")
     return f"by {share}\u00a0% of the prior's variance{together}"
 

@@ -69,7 +69,7 @@ def _summary(magnet: Magnet, prior: MeasuredPrior) -> Plain:
         "parameters": len(prior.nominal),
         "rms_sd_A_per_m": rms(prior.gaussian.sd),
         "rms_shift_A_per_m": rms(prior.gaussian.mean - prior.nominal),
-        "common_mode_sd": magnet.study.prior.common_mode_sd,
+        "common_mode_sd": magnet.study.prior.calibration_sd,
         "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
         "doubts": list(prior.doubts), "far": prior.far,
         "not_normal": [samples.label for samples in prior.types if not samples.normal],
@@ -175,7 +175,7 @@ def answer(prior: MeasuredPrior) -> Answer:
 def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
     """Return the page of what measured blocks say about a magnet."""
     summary, parts, rows = _summary(magnet, prior), parts_table(magnet, prior), type_table(prior)
-    common, mounting = magnet.study.prior.common_mode_sd, magnet.study.prior.mounting_sd_deg
+    common, mounting = magnet.study.prior.calibration_sd, magnet.study.prior.mounting_sd_deg
     calibration = (
         f"All blocks share a calibration error of {100 * common:.3g} % (sd)." if common > 0 else
         "The study has no `prior.common_mode_sd`: the calibration of the coil is assumed to be "

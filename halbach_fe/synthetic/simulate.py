@@ -502,7 +502,7 @@ class DrawnMagnet:
 def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
     """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
     prior = study.prior
-    common = float(prior.common_mode_sd * generator.standard_normal())
+    common = float(prior.shared_sd * generator.standard_normal())
     single, turns = [], []
     for body in nominal.bodies:
         deviation = generator.standard_normal(3) * [
@@ -555,7 +555,7 @@ def coil_table(
     -------
     table : BlockTable
     calibration : float
-        Relative error of the coil, drawn with the standard deviation ``prior.common_mode_sd``. It
+        Relative error of the coil, drawn with the standard deviation ``prior.calibration_sd``. It
         is the same for all blocks, whose moments are measured too small if it is positive.
     """
     length = study.array.ring_length_m or study.array.outer_radius_m  # of infinite blocks
@@ -566,7 +566,7 @@ def coil_table(
     bodies = _before_mounting(nominal, there.values())
     true = moments(_before_mounting(single, there.values()), length)
     sigma = coil_sd * np.linalg.norm(moments(bodies, length), axis=1)
-    calibration = float(study.prior.common_mode_sd * generator.standard_normal())
+    calibration = float(study.prior.calibration_sd * generator.standard_normal())
     measured = true / (1 + calibration) + sigma[:, None] * generator.standard_normal(true.shape)
     # the last digits differ from solve to solve
     digits = 10 - int(np.log10(np.abs(measured).max()))
