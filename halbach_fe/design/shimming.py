@@ -535,7 +535,7 @@ def _nominal_spares(magnet: Magnet, mounts: Mounts) -> SpareBlocks:
     size, settings = magnet.dimension, magnet.study.prior
     vectors = np.array([block.magnetization for block in as_meant(magnet).blocks])
     prior = nominal_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
-                        settings.direction_sd_deg, settings.shared_sd)
+                        settings.direction_sd_deg, magnet.study.shared_sds)
     roots = np.asarray(prior.root).reshape(len(vectors), size, -1)
     own = np.zeros((len(vectors), 3, 3))
     for number, rows in enumerate(roots):

@@ -161,7 +161,7 @@ def assembled_prior(
     if measured is not None:
         return with_others(measured, magnet, len(nominal) - len(uniform))
     blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
-                           settings.shared_sd)
+                           magnet.study.shared_sds)
     turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
     return with_others(
         Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),

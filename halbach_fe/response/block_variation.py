@@ -194,7 +194,7 @@ def study_prior(magnet: Magnet, count: int) -> Gaussian:
     settings = magnet.study.prior
     return with_others(nominal_prior(
         magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, settings.shared_sd), magnet, count)
+        settings.direction_sd_deg, magnet.study.shared_sds), magnet, count)
 
 
 def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
@@ -209,7 +209,7 @@ def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Float
         return []
     root = sparse.csr_array(root_matrix(nominal_prior(
         magnet.nominal_magnetization, 3, settings.magnitude_sd, settings.direction_sd_deg,
-        settings.shared_sd).root)).toarray().reshape(len(magnet.blocks), 3, -1)
+        magnet.study.shared_sds).root)).toarray().reshape(len(magnet.blocks), 3, -1)
     own = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks]) @ root
     return [(neighbour_blocks(magnet.blocks, (one,)),
              one.factor * rotation_about_z(np.radians(one.turn_deg)) @ own) for one in neighbours]

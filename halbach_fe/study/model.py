@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array, common_material, remanence_sds
@@ -187,7 +188,7 @@ class Study(StudyModel, metaclass=_OfKeys):
             tables["prior__remanence_sd"] = {
                 name: known.get(name, grade(name).remanence_sd)
                 for name, is_of_grade in changed.array.grades
-                if name and is_of_grade and (name in known or name not in named)}
+                if name and (name in known or (is_of_grade and name not in named))}
         old, new = grade_of(self.array), grade_of(changed.array)
         if (found := changed.demagnetization) and old and new and new is not old:
             given = {key: value for key, value in dict(found).items()
@@ -297,6 +298,17 @@ class Study(StudyModel, metaclass=_OfKeys):
             own_name(name): value for name, value in each.change.items()
             if value and own_name(name)})]
         return type(self).model_validate(values | own | {"maps": (), "uncertain": uncertain})
+
+    @property
+    def shared_sds(self) -> Floats:
+        """Standard deviations (blocks, k) of k independent deviations that blocks share, relative
+        to nominal: one of all blocks, or one of those of each grade.
+        """
+        prior, grades = self.prior, self.array.grades
+        if prior.common_mode_sd is not None or not prior.remanence_sd:
+            return np.full((len(grades), 1), prior.calibration_sd)
+        return np.array([[sd * (own == name) for name, sd in prior.remanence_sd.items()]
+                         for own, _ in grades])
 
     def demagnetization_of(self, material: str | None) -> Demagnetization:
         """Return what blocks of a grade withstand, by the name of the grade.

@@ -258,6 +258,9 @@ def test_another_grade_replaces_what_the_first_one_said():
     assert changed.array == told.array
     assert changed.array.remanence_T == 1.19
     assert changed.prior == told.prior
+    assert told.prior.remanence_sd == {"N35H": grade("N35H").remanence_sd}
+    weaker = told.with_(array__remanence_T=1.18)  # as an effect that is found, not as stated
+    assert weaker.prior == told.prior
     assert changed.demagnetization == told.demagnetization
     assert changed.demagnetization.squareness == 0.8  # the study's own
     own = study_with(material="N52", remanence_T=1.43).with_(array__recoil_permeability=1.02)
