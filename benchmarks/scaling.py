@@ -87,7 +87,7 @@ def write_campaign(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     nominal = np.concatenate([block.magnetization for block in build_magnet(study).blocks])
     prior = study.prior
     truth = nominal_prior(nominal, 3, prior.magnitude_sd, prior.direction_sd_deg,
-                        prior.common_mode_sd).sample(1, generator)[0]
+                        prior.shared_sd).sample(1, generator)[0]
     points = points_from(study.observation.positions)
     field = cuboid_field(document, truth.reshape(-1, 3), points)
     assert study.noise is not None

@@ -349,7 +349,7 @@ OBJECTIVE = together(MULTIPOLES, option(
 
 REGION = together(
     either(option("--sphere-m", positive_number, "R", "radius of the sphere in m (default: the "
-                  "study's region, or half the radius of the bore)"),
+                  "study's region, or half the radius of the bore about the magnet's centre)"),
            option("--ellipsoid-m", positive_number, ("A", "B", "C"),
                   "half axes along x, y and z in m", nargs=3),
            option("--cylinder-m", positive_number, ("R", "LENGTH"),

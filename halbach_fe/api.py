@@ -526,7 +526,8 @@ def homogeneity(
     session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     region : Region, optional
-        By default the study's, or the sphere about the origin of half the radius of the bore.
+        By default the study's, or the sphere of half the radius of the bore about the axis in the
+        middle of the magnet.
     posterior : mapping of str to Gaussian, or InferenceResult, optional
         Distributions of the magnetizations in A/m by name. By default the study's prior of an
         assembled magnet is the only distribution.

@@ -120,7 +120,8 @@ def shim_tray(
     posterior : Gaussian or InferenceResult
         Distribution of the magnetizations of the measured magnet in A/m.
     region : Region, optional
-        By default the study's, or the sphere about the origin of half the radius of the bore.
+        By default the study's, or the sphere of half the radius of the bore about the axis in the
+        middle of the magnet.
 
     Returns
     -------

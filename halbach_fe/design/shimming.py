@@ -549,7 +549,7 @@ def _nominal_spares(magnet: Magnet, mounts: Mounts) -> SpareBlocks:
     size, settings = magnet.dimension, magnet.study.prior
     vectors = np.array([block.magnetization for block in as_meant(magnet).blocks])
     prior = nominal_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
-                        settings.direction_sd_deg, settings.common_mode_sd)
+                        settings.direction_sd_deg, magnet.study.shared_sds)
     roots = np.asarray(prior.root).reshape(len(vectors), size, -1)
     own = np.zeros((len(vectors), 3, 3))
     for number, rows in enumerate(roots):
@@ -574,7 +574,7 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
     first = np.array([number[label] for label in table.type])
     own, spread = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     own[:, :size], spread[:, :size, :size] = mean, root
-    common = magnet.study.prior.common_mode_sd**2 * np.einsum("ni,nj->nij", own, own)
+    common = magnet.study.prior.calibration_sd**2 * np.einsum("ni,nj->nij", own, own)
     covariance = spread @ spread.transpose(0, 2, 1) + common
     return SpareBlocks(table.serial, own, covariance, mounts.designed[first], mounts.kinds[first],
                        np.full(len(table), -1))

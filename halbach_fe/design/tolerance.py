@@ -172,7 +172,7 @@ def assembled_prior(
         return with_neighbours(
             magnet, with_others(measured, magnet, len(nominal) - len(uniform)))
     blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
-                           settings.common_mode_sd)
+                           magnet.study.shared_sds)
     turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
     return with_neighbours(magnet, with_others(
         Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),

@@ -206,10 +206,12 @@ class _Comparison:
         """Return the competitor that has a whitened signature (rows, k)."""
         effect, in_model = hypothesis.effect, hypothesis.key in self.point.in_model
         columns = signature * amplitude_scale(effect)[:signature.shape[1]]
-        # What all blocks share is known this well only, as the calibration of the coil. A block
+        # What all blocks share is known this well only, or the calibration of the coil. A block
         # that is reversed or elsewhere has it with another sign or direction, which the prior does
         # not know.
-        common = self.point.update.study.prior.common_mode_sd
+        update = self.point.update
+        common = (update.study.prior.shared_sd if update.measured_blocks is None else
+                  update.study.prior.calibration_sd)
         if effect.is_binary and common and not in_model and not is_rough:
             columns = np.hstack([columns, common * columns])
         count = columns.shape[1]

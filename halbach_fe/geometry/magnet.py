@@ -146,17 +146,10 @@ class Magnet(ShownInNotebook):
         """Whether the field is a non-linear function of the magnetizations (iron with a curve)."""
         return is_nonlinear(self.study)
 
-    @cached_property
+    @property
     def materials(self) -> tuple[str | None, ...]:
         """Name of the grade of every block; None where the study names none."""
-        array, table = self.array, self.array.free_blocks
-        of_ring = {ring: one.material for ring, one in enumerate(array.ring, start=1)}
-        own = [of_ring.get(block.ring) for block in self.blocks]
-        if table is not None:
-            first = len(own) - len(table)
-            own[first:] = [table.material[number] if table.material else None
-                           for number in range(len(table))]
-        return tuple(each or array.material for each in own)
+        return tuple(name for name, _ in self.array.grades)
 
     @cached_property
     def demagnetizations(self) -> tuple[Demagnetization, ...]:

@@ -1,9 +1,9 @@
 """The prior from moments of single blocks, measured before the magnet was assembled.
 
-The moment m of a block is corrected for the self-demagnetization of the single block. With the mean
-H = -N M over its volume V, ``B = mu_0 mu H + B_r`` gives ``m/V = (1 + (mu - 1) N)^-1 B_r / mu_0``.
-The parameter of the model is therefore ``M = B_r / (mu_0 mu) = mu^-1 (1 + (mu - 1) N) m / V``,
-where mu and N are tensors. The formula assumes that the block is magnetized uniformly, an error of
+The moment m of a block of the volume V is corrected for the self-demagnetization of the single
+block, ``B_r = (1 + (mu - 1) N) mu_0 m / V`` (`remanence_per_polarization`; of a table of B_r there
+is nothing to correct). The parameter of the model is ``M = B_r / (mu_0 mu)``, where mu and N are
+tensors. The formula assumes that the block is magnetized uniformly, an error of
 second order in mu - 1: for a single sector of the FASER dipole M is too large by 7e-5 at mu = 1.05
 and by 2e-3 at mu = 1.3 (NGSolve, order 4). Without the correction the errors would be 1.5e-2 and
 8e-2.
@@ -32,8 +32,8 @@ from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import as_meant, mountings
-from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.solver.exact_block_field import demagnetizing_tensors
+from halbach_fe.measurement.block_table import REMANENT, BlockTable
+from halbach_fe.solver.exact_block_field import remanence_per_polarization
 from halbach_fe.stats.gaussian import Gaussian, remounted_root
 from halbach_fe.stats.small_samples import (
     anderson_darling,
@@ -206,7 +206,7 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     own[~own.any(axis=(1, 2))] = np.eye(size)  # of blocks that the magnet does not have
     gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
                               np.radians(magnet.study.prior.mounting_sd_deg),
-                              magnet.study.prior.common_mode_sd)
+                              magnet.study.prior.calibration_sd)
     types = _tested(members, intensities)
     odd = [samples.label for samples in types if not samples.normal]
     if odd and not placed:
@@ -288,7 +288,7 @@ def _mean_doubts(magnet: Magnet, members: dict[str, Floats]) -> list[str]:
     deviations = np.concatenate(list(members.values()))
     settings = magnet.study.prior
     mean = float(deviations[:, 0].mean())
-    sd = float(np.hypot(settings.magnitude_sd, settings.common_mode_sd))
+    sd = float(np.hypot(settings.magnitude_sd, settings.shared_sd))
     if abs(mean) <= MANY_SD * sd:
         return []
     side = "stronger" if mean > 0 else "weaker"
@@ -306,7 +306,7 @@ def _noise_doubts(magnet: Magnet, gaussian: Gaussian) -> list[str]:
     spoil what is known, and not only add nothing.
     """
     own, across = magnet.study.prior, magnet.dimension - 1
-    stated = float(np.linalg.norm((own.magnitude_sd, own.common_mode_sd,
+    stated = float(np.linalg.norm((own.magnitude_sd, own.shared_sd,
                                    *across * (np.radians(own.direction_sd_deg),))))
     known = rms(gaussian.sd) / rms(magnet.nominal_magnetization)
     best = 1e-5  # of a moment: good coils repeat within some 1e-4, and are calibrated less well
@@ -452,15 +452,8 @@ def _frame(block: MagnetBlock) -> Floats:
     return np.asarray(axes * float(np.linalg.norm(block.magnetization)))
 
 
-def _of_block(block: MagnetBlock, tensor: Floats) -> Floats:
-    """Return ``mu^-1 (1 + (mu - 1) N)`` (3, 3) of a block with the demagnetizing tensor N."""
-    mu = block.recoil_tensor
-    inside = np.eye(3) + (mu - np.eye(3)) @ tensor
-    return np.asarray(np.linalg.solve(mu, inside))
-
-
 def _conversions(magnet: Magnet, table: BlockTable, index: Ints) -> Floats:
-    """Return the matrices (rows, 3, 3) from measured moments in A m^2 to M in A/m.
+    """Return the matrices (rows, 3, 3) from the moments of a table in A m^2 to M in A/m.
 
     M is along the array's axes. A block of the study gets the measured moment, which is what its
     field is made of, and M is therefore the moment per volume of the study's block even where the
@@ -491,10 +484,11 @@ def _conversions(magnet: Magnet, table: BlockTable, index: Ints) -> Floats:
                 f"{block.volume:.4g} m^3 of its block {block.name}", f"{volume:.4g} m^3",
                 "Check its unit, and the sizes of the study's blocks."))
         real.append(block)
-    tensors = demagnetizing_tensors(real)
+    factors = [np.eye(3)] * len(real) if REMANENT.items() <= table.attributes.items(
+        ) else remanence_per_polarization(real)
     return np.array([
-        _of_block(block, tensor) @ rotation_about_z(np.radians(block.angle_deg)) / block.volume
-        for block, tensor in zip(real, tensors, strict=True)])
+        np.linalg.solve(block.recoil_tensor, factor @ rotation_about_z(np.radians(block.angle_deg)))
+        / block.volume for block, factor in zip(real, factors, strict=True)])
 
 
 def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
@@ -667,11 +661,11 @@ def _check_alike(
     blocks = magnet.blocks
     finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block
               for block in blocks]
-    tensors = demagnetizing_tensors(finite)
+    factors = remanence_per_polarization(finite)
     seen = np.array([
-        np.linalg.solve(_frame(block), _of_block(block, tensor) @ axes(block)) / block.volume
+        np.linalg.solve(block.recoil_tensor @ _frame(block), factor @ axes(block)) / block.volume
         if block.remanence else np.zeros((3, 3))
-        for block, tensor in zip(finite, tensors, strict=True)])
+        for block, factor in zip(finite, factors, strict=True)])
     for label, own in types_of(magnet).items():
         members = [number for number in own if blocks[number].remanence]
         first = members[0] if members else -1

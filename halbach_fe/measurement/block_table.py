@@ -26,6 +26,8 @@ MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
 REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")
 COLUMNS = ("serial", "type", "ring", "slot", *REQUIRED_COLUMNS[1:], "volume_m3", "temperature_C")
 TURN_COLUMNS = ("turn_x_deg", "turn_y_deg", "turn_z_deg")
+REMANENT = {"moments": "B_r V / mu_0"}
+"""Attribute of a table whose moments are not those that a coil measures of lone blocks."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class BlockTable:
     ring, slot : ndarray of int, shape (n,)
         Place in the magnet, counted from 1; both 0 if the place is not known.
     moment : ndarray, shape (n, 3), in A m^2
-        Magnetic moment, in the axes of the block at its place in the magnet.
+        Magnetic moment of the lone block, in the axes of the block at its place in the magnet; B_r
+        times the volume by mu_0 if ``attributes`` have `REMANENT`.
     sigma : ndarray, shape (n,), in A m^2
         Standard deviation of each component of the moment, independent from block to block.
     volume : ndarray, shape (n,), in m^3
@@ -48,7 +51,7 @@ class BlockTable:
     temperature : ndarray, shape (n,), in degrees Celsius
         Temperature at the measurement, NaN if it is not known.
     attributes : mapping
-        Provenance, as free text by key.
+        Provenance, as free text by key, and `REMANENT`.
     source : str
         Name of the table in error messages.
     turn_deg : ndarray, shape (n, 3), in degrees, or None

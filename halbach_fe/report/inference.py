@@ -202,9 +202,9 @@ def axis_rows(axis: MagneticAxis | None) -> Rows:
     return [{"of the updated magnet": what, "value": value} for what, value in found.items()]
 
 
-def definition(axis: MagneticAxis | None) -> str:
-    """Return how centre, axis and roll are defined for the magnet's order, in sentences; empty
-    without an axis.
+def definition(axis: MagneticAxis | None, middle_z_m: float) -> str:
+    """Return how centre, axis and roll are defined for the magnet's order and middle, in sentences;
+    empty without an axis.
     """
     if axis is None:
         return ""
@@ -219,9 +219,9 @@ def definition(axis: MagneticAxis | None) -> str:
                 "finite length, where the gradient of the main component vanishes; a homogeneous "
                 f"field may have none there. {roll}")
     return (f"The centre is where the multipole of order {axis.order - 1} vanishes"
-            + (", the axis the straight line through the centres along the middle half of the "
-               "magnet; the centre is its point at z = 0. " if axis.slope_rad is not None
-               else ". ") + roll)
+            + ("" if axis.slope_rad is None else
+               ", the axis the straight line through the centres along the middle half of the "
+               f"magnet; the centre is its point at z = {1e3 * middle_z_m:g} mm") + f". {roll}")
 
 
 ALONE = "by the readings alone"
@@ -352,7 +352,8 @@ def page(result: InferenceResult) -> Page:
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
             Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
-            Section([*doubtful, definition(result.magnetic_axis), Table(axis)],
+            Section([*doubtful, definition(result.magnetic_axis, result.magnet.middle_z_m),
+                     Table(axis)],
                     "Magnetic centre, axis and roll", about=axis),
             *sections_of_stray(stray, warning=doubtful),
             *sections_of_circles(
@@ -546,7 +547,7 @@ def _contraction_in_words(result: InferenceResult, contraction: Floats) -> str:
         return "none: the prior leaves nothing open"
     low, high = (f"{100 * end:.0f}" for end in (contraction.min(), contraction.max()))
     share = f"{low} to {high}" if low != high else low
-    together = ("" if result.measured_blocks is None or not result.study.prior.common_mode_sd else
+    together = ("" if result.measured_blocks is None or not result.study.prior.calibration_sd else
                 "; a part of it is the calibration of the coil, which all measured blocks share")
     return f"by {share}\u00a0% of the prior's variance{together}"
 

@@ -68,7 +68,7 @@ def _summary(prior: MeasuredPrior) -> Plain:
         "parameters": len(prior.nominal),
         "rms_sd_A_per_m": rms(prior.gaussian.sd),
         "rms_shift_A_per_m": rms(prior.gaussian.mean - prior.nominal),
-        "common_mode_sd": prior.magnet.study.prior.common_mode_sd,
+        "common_mode_sd": prior.magnet.study.prior.calibration_sd,
         "mounting_sd_deg": prior.magnet.study.prior.mounting_sd_deg,
         "doubts": list(prior.doubts), "far": prior.far,
         "not_normal": [samples.label for samples in prior.types if not samples.normal],
@@ -173,7 +173,7 @@ def answer(prior: MeasuredPrior) -> Answer:
 def page(prior: MeasuredPrior) -> Page:
     """Return the page of what measured blocks say about a magnet."""
     magnet, parts, rows = prior.magnet, parts_table(prior), type_table(prior)
-    common, mounting = magnet.study.prior.common_mode_sd, magnet.study.prior.mounting_sd_deg
+    common, mounting = magnet.study.prior.calibration_sd, magnet.study.prior.mounting_sd_deg
     calibration = (
         f"All blocks share a calibration error of {100 * common:.3g} % (sd)." if common > 0 else
         "The study has no `prior.common_mode_sd`: the calibration of the coil is assumed to be "

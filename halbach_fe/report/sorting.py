@@ -184,7 +184,7 @@ def _answer(found: SortedBlocks) -> Answer:
     prior = found.study.prior  # and what the uncertainty of the blocks makes
     spread = float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
     known = ["the measured moments", *(words for words, there in (
-        ("the calibration of the coil", prior.common_mode_sd > 0),
+        ("the calibration of the coil", prior.calibration_sd > 0),
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
     orders = (f"in all random orders about {text(low)}" if text(low) == text(high) else
               f"in 95 % of random orders {text(low)} to {text(high)}")

@@ -316,8 +316,10 @@ NOMINAL = ("Shapes and places count as nominal: what their tolerances make comes
 
 def tolerances_in_words(prior: Prior) -> str:
     """Say which tolerances of the blocks were drawn, and which were not, in sentences."""
-    together = (f", all of them together by {100 * prior.common_mode_sd:g} %"
-                if prior.common_mode_sd > 0 else "")
+    shared = ({f"those of {name}": sd for name, sd in prior.remanence_sd.items()}
+              if prior.common_mode_sd is None else {"all of them": prior.common_mode_sd})
+    together = "".join(
+        f", {which} together by {100 * sd:.3g} %" for which, sd in shared.items() if sd > 0)
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
     return (f"each block varies by {100 * prior.magnitude_sd:g} % and "

@@ -200,7 +200,7 @@ def study_prior(magnet: Magnet, count: int) -> Gaussian:
     settings = magnet.study.prior
     return with_others(nominal_prior(
         magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, settings.common_mode_sd), magnet, count)
+        settings.direction_sd_deg, magnet.study.shared_sds), magnet, count)
 
 
 def neighbour_prior(magnet: Magnet) -> Gaussian:
@@ -212,7 +212,7 @@ def neighbour_prior(magnet: Magnet) -> Gaussian:
     settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
     root = sparse.csr_array(root_matrix(nominal_prior(
         magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, settings.common_mode_sd).root))
+        settings.direction_sd_deg, magnet.study.shared_sds).root))
     return Gaussian(np.zeros(neighbour_parameters(magnet)), stacked_root(
         sparse.csr_array(sparse.kron(sparse.eye_array(len(neighbours)), root))))
 

@@ -8,7 +8,7 @@ nominal magnet. A turn by theta multiplies C_N by exp(-i N theta), see
 (x0, y0) has at the origin, by feed-down, ``C_(N-1) = -(N - 1) C_N (x0 + i y0) / R``.
 
 **Axis**, N >= 2: the straight line along z through the centres at several heights, by least
-squares. Its point at z = 0 is the centre of a 3D magnet.
+squares. Its point in the middle along z, `Magnet.middle_z_m`, is the centre of a 3D magnet.
 
 **Centre**, N = 1, in 3D: the stationary point of the component along the field, where its gradient
 vanishes: that is where a homogeneous magnet is most homogeneous. It is a saddle point, since the
@@ -69,7 +69,8 @@ class MagneticAxis:
     roll_rad, roll_sd_rad : float
         Right-handed about z.
     centre_m, centre_sd_m : tuple of float or None
-        x and y, of a dipole in 3D x, y and z; None if no centre is defined.
+        x and y, of a dipole in 3D x, y and z; None if no centre is defined. That of an axis is in
+        the middle of the magnet along z.
     slope_rad, slope_sd_rad : tuple of float or None
         dx/dz and dy/dz of the axis; None for dipoles and cross-sections.
     """
@@ -107,17 +108,17 @@ def magnetic_axis(
     """
     magnetizations = distribution_of(magnet, magnetizations, "magnetizations").stacked
     flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius
-    radius = RADIUS * bore
-    reach = 0.0 if flat else LENGTH * magnet.array_half_length
-    heights = np.zeros(1) if flat else np.linspace(-reach, reach, HEIGHTS)
+    radius, middle = RADIUS * bore, np.array([0.0, 0.0, magnet.middle_z_m])
+    reach = 0.0 if flat else LENGTH * (magnet.array_half_length - abs(middle[2]))
+    heights = np.zeros(1) if flat else np.linspace(-reach, reach, HEIGHTS)  # from the middle
     count = 2 * (order + 2)
     angles = 2 * np.pi * np.arange(count) / count
     circle = radius * unit_circle(angles)
     around = (circle + heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
     # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
     sphere = bore / 4 * _ON_SPHERE
-    points = np.vstack([around, sphere]) if order == 1 and not flat else around
-    if magnet.contains(points).any() or _has_source(magnet, bore / 4, reach):
+    points = middle + (np.vstack([around, sphere]) if order == 1 and not flat else around)
+    if magnet.contains(points).any() or _has_source(magnet, bore / 4, middle[2] + heights):
         return None  # something stands in the bore
     size = magnet.dimension
     field, nominal, columns = (
@@ -143,7 +144,8 @@ def magnetic_axis(
     if order == 1:
         if flat:
             return MagneticAxis(order, roll, roll_sd)
-        centre = _stationary(field[len(around):], columns[len(around):], bore / 4, magnetizations)
+        centre = _stationary(
+            field[len(around):], columns[len(around):], bore / 4, middle, magnetizations)
         return MagneticAxis(order, roll, roll_sd, *centre)
     below, below_root = multipole(order - 1, field), multipole(order - 1, columns)
     scale = -radius / (order - 1)
@@ -161,10 +163,10 @@ def magnetic_axis(
     return MagneticAxis(order, roll, roll_sd, *both(0), *(() if flat else both(1)))
 
 
-def _has_source(magnet: Magnet, radius: float, reach: float) -> bool:
-    """Return whether a coil or dipole is within a radius in m of the axis up to |z| = reach."""
-    axis = np.zeros((1 + 2 * int(np.ceil(2 * reach / radius)), 3))
-    axis[:, 2] = np.linspace(-reach, reach, len(axis))
+def _has_source(magnet: Magnet, radius: float, heights: Floats) -> bool:
+    """Return whether a coil or dipole is within a radius in m of the axis along heights in m."""
+    axis = np.zeros((1 + 2 * int(np.ceil(np.ptp(heights) / radius)), 3))
+    axis[:, 2] = np.linspace(heights[0], heights[-1], len(axis))
     return any((distance_in_magnet(coil, axis) < radius).any()
                for coil in magnet.external.coils) or any(
         (np.linalg.norm(axis - one.position_m, axis=1) < radius).any()
@@ -207,14 +209,14 @@ follow it to degree 3, were off by 0.05 mm in a dipole of 24 cubes of 1 %, 18 er
 
 
 def _stationary(
-    field: Floats, columns: Floats, radius: float, magnetizations: Gaussian
+    field: Floats, columns: Floats, radius: float, origin: Floats, magnetizations: Gaussian
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | tuple[()]:
     """Return the stationary point of the component along the field, and its standard deviations.
 
-    Both are (3,) in m. They are empty if the point is not in the sphere of a ``radius`` in m, on
-    which B (26, 3) is given, or may be out of it by its standard deviations: farther away the field
-    of a homogeneous magnet may be stationary anywhere. The curvatures count as those of the mean
-    magnetizations. ``columns`` (26, 3, parameters) belong to B.
+    Both are (3,) in m. They are empty if the point is not in the sphere of a ``radius`` in m about
+    the ``origin``, on which B (26, 3) is given, or may be out of it by its standard deviations:
+    farther away the field of a homogeneous magnet may be stationary anywhere. The curvatures count
+    as those of the mean magnetizations. ``columns`` (26, 3, parameters) belong to B.
     """
     fit = np.linalg.pinv(solid_harmonic_fields(_ON_SPHERE, _DEGREES).reshape(field.size, -1))
     amplitudes = fit @ field.ravel()
@@ -241,4 +243,4 @@ def _stationary(
     sd = magnetizations.sd_of(rows)
     if np.linalg.norm(sd) > 1:
         return ()
-    return tuple((radius * found.x).tolist()), tuple((radius * sd).tolist())
+    return tuple((origin + radius * found.x).tolist()), tuple((radius * sd).tolist())

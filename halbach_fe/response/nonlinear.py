@@ -135,7 +135,7 @@ def nonlinear_model(
                            np.nan)
     settings = magnet.study.prior
     prior = prior or nominal_prior(linear.nominal, magnet.dimension, settings.magnitude_sd,
-                                   settings.direction_sd_deg, settings.common_mode_sd)
+                                   settings.direction_sd_deg, magnet.study.shared_sds)
     # number of magnetizations for which the model is compared with GetDP's Newton method
     verified_samples = 3
     samples = prior.sample(verified_samples, generator)

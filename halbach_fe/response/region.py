@@ -524,12 +524,12 @@ def _advice(magnet: Magnet, region: Region) -> str:
 
 
 def default_region(magnet: Magnet) -> Region:
-    """Return the region of the study, or the sphere about the origin of half the bore's radius."""
+    """Return the region of the study, or the sphere about the magnet of half the bore's radius."""
     asked = magnet.study.homogeneity
     own = None if asked is None else Region.of(
         asked.sphere_m, asked.ellipsoid_m, asked.cylinder_m, asked.centre_m)
     inside = 0.5  # radius of the default sphere, relative to that of the bore
-    return own or Region.sphere(inside * magnet.bore_radius)
+    return own or Region.sphere(inside * magnet.bore_radius, (0.0, 0.0, magnet.middle_z_m))
 
 
 Distance = Callable[[Floats], Floats]

@@ -396,6 +396,16 @@ def demagnetizing_tensors(blocks: Sequence[MagnetBlock]) -> list[Floats]:
     return tensors
 
 
+def remanence_per_polarization(blocks: Sequence[MagnetBlock]) -> list[Floats]:
+    """Return ``1 + (mu - 1) N`` (3, 3) of every block, with its demagnetizing tensor N.
+
+    It turns the mean polarization of the lone block, mu_0 times the moment per volume, into B_r:
+    with the mean H = -N M, ``B = mu_0 mu H + B_r`` gives ``B_r = (1 + (mu - 1) N) mu_0 M``.
+    """
+    return [np.eye(3) + (block.recoil_tensor - np.eye(3)) @ tensor
+            for block, tensor in zip(blocks, demagnetizing_tensors(blocks), strict=True)]
+
+
 def external_field(magnet: Magnet, points: Floats) -> Floats:
     """Return B (n, 3) in T of the study's external sources at points (n, 3) in m.
 

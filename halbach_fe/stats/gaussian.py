@@ -203,13 +203,13 @@ def correlated_values(mean: Floats, covariance: Floats, normals: Floats) -> Floa
 
 def nominal_prior(
     nominal: Floats, dimension: int, magnitude_sd: float, direction_sd_deg: float,
-    common_mode_sd: float = 0.0,
+    shared_sds: Floats | float = 0.0,
 ) -> Gaussian:
     """Return a prior about the nominal magnetizations.
 
     Every block deviates independently in magnitude (along its easy axis) and in direction (across
-    the axis); in addition the magnitudes of all blocks share one relative deviation, the common
-    mode.
+    the axis); in addition the magnitudes share relative deviations: all of them one, the common
+    mode, or those of each grade one.
 
     Parameters
     ----------
@@ -222,8 +222,9 @@ def nominal_prior(
     direction_sd_deg : float
         Standard deviation of the angle about each axis across the easy axis, in degrees. The angle
         is assumed small, so that the deviation is the magnetization times the angle in rad.
-    common_mode_sd : float
-        Standard deviation of the common mode, as a fraction of the nominal magnetization.
+    shared_sds : float or ndarray, shape (blocks, k)
+        Standard deviation of the common mode, or of each of k independent deviations in every
+        block, as fractions of the nominal magnetization.
     """
     roots = np.zeros((nominal.size // dimension, dimension, dimension))
     for root, vector in zip(roots, nominal.reshape(-1, dimension), strict=True):
@@ -235,8 +236,10 @@ def nominal_prior(
         root[:] = magnitude * np.hstack(
             [magnitude_sd * axis, np.radians(direction_sd_deg) * across])
     independent = block_diagonal_root(roots)
-    return Gaussian(nominal, stacked_root(independent, common_mode_sd * nominal[:, None])
-                    if common_mode_sd > 0 else independent)
+    shared = np.atleast_2d(shared_sds)
+    columns = nominal.reshape(-1, dimension, 1) * shared[:, None, :]
+    return Gaussian(nominal, stacked_root(independent, columns.reshape(nominal.size, -1))
+                    if shared.any() else independent)
 
 
 def block_diagonal_root(roots: Floats) -> CovarianceFactor:

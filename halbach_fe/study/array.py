@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
@@ -14,6 +15,7 @@ from halbach_fe.study.grades import (
     STRENGTHS,
     Material,
     doubted_strength,
+    grade,
     grade_of,
     with_grade,
     without_old_grade,
@@ -247,7 +249,7 @@ class Array(_OfGrade):
     ``recoil_permeability_across`` holds perpendicular to it (default: the same). Exactly one of
     ``remanence_T`` and ``block_moment_A_m2``, the magnetic moment of every block, gives the
     strength. ``material`` names a grade of magnet (``"N42SH"``), which gives the remanence, the
-    recoil permeability, ``prior.common_mode_sd`` and the keys of ``demagnetization`` where the
+    recoil permeability, ``prior.remanence_sd`` and the keys of ``demagnetization`` where the
     study does not.
     """
 
@@ -381,6 +383,25 @@ class Array(_OfGrade):
         regular = own or (self.blocks_per_ring,) * self.rings
         return regular + (self.free_blocks.blocks_by_ring if self.free_blocks else ())
 
+    @cached_property
+    def grades(self) -> tuple[tuple[str | None, bool], ...]:
+        """Grade of every block, None where the study names none, and whether the block has the
+        nominal remanence of that grade.
+        """
+        of_array = (self.material, self.remanence_T)
+        found = []
+        for number, count in enumerate(self.blocks_by_ring[:self.rings]):
+            ring = self.ring[number] if self.ring else None
+            stated = ring and (ring.remanence_T or ring.block_moment_A_m2)
+            found += count * [of_array if ring is None else (
+                ring.material or self.material, ring.remanence_T if stated else self.remanence_T)]
+        if table := self.free_blocks:
+            empty = (None,) * len(table)
+            found += [(name or self.material, remanence) for name, remanence in zip(
+                table.material or empty, table.remanence_T or empty, strict=True)]
+        return tuple((name, name is not None and remanence == grade(name).nominal_remanence)
+                     for name, remanence in found)
+
     def block_of(self, exception: BlockException) -> tuple[int, int] | None:
         """Return ring and slot of the block that an exception holds for; None if for several."""
         ring = exception.ring or (1 if len(self.blocks_by_ring) == 1 else None)
@@ -414,14 +435,14 @@ def common_material(array: dict[str, Any]) -> str | None:
     return found[0] if known and array.get("material") is None else array.get("material")
 
 
-def remanence_sd(array: dict[str, Any]) -> float | None:
-    """Return the largest standard deviation of the remanences that follow from grades, as fractions
-    of these; None if none does.
+def remanence_sds(array: dict[str, Any]) -> dict[str, float]:
+    """Return the standard deviations of the remanences that follow from grades, as fractions of
+    these, by the name of the grade.
     """
     own = grade_of({"material": common_material(array)})
     found = [grade_of({"material": name}) or own for name, is_stated in _materials(array)
              if not is_stated]
-    return max((one.remanence_sd for one in found if one is not None), default=None)
+    return {one.name: one.remanence_sd for one in found if one is not None}
 
 
 def _materials(array: dict[str, Any]) -> list[tuple[str | None, bool]]:

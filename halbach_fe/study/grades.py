@@ -2,7 +2,7 @@
 
 A data sheet promises a range of the remanence, not a value. The blocks of one delivery come from a
 few melts, so that they lie together somewhere in the range: its width is the standard deviation of
-an error that all blocks share (``prior.common_mode_sd``), and says little about differences between
+an error that all blocks share (``prior.remanence_sd``), and says little about differences between
 the blocks. Every row of the table names its source; what no source says is None.
 """
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
+from halbach_fe.study.grades import Material
 from halbach_fe.study.measurement import Instrument, NoiseSettings, Positions
 from halbach_fe.study.types import (
     COMPONENTS,
@@ -34,6 +35,8 @@ class Prior(StudyModel):
     ``magnitude_sd`` and ``common_mode_sd`` are fractions of the nominal magnetization. The
     deviation of ``magnitude_sd`` is independent from block to block; that of ``common_mode_sd`` is
     shared by all blocks (an error of the data sheet, or of the Helmholtz coil's calibration).
+    Without it blocks share what ``remanence_sd`` has for their grade: that of its data sheet, where
+    their remanence is that of the grade.
     ``direction_sd_deg`` is the standard deviation of the angle of the magnetization, in each of the
     two directions perpendicular to the easy axis.
 
@@ -44,7 +47,7 @@ class Prior(StudyModel):
 
     The other keys concern a block table, the measured moments of the single blocks (see
     `halbach_fe.measurement.block_table`). With a block table, the measured moments replace
-    ``magnitude_sd`` and ``direction_sd_deg``; ``common_mode_sd`` still applies.
+    ``magnitude_sd``, ``direction_sd_deg`` and ``remanence_sd``; ``common_mode_sd`` still applies.
     ``mounting_sd_deg`` is the standard deviation of the rotation of a mounted block about each
     axis. ``types`` lists the slots of every block type; by default every slot is a type of its own,
     labelled by its number. With ``temperature_coefficient_per_K`` and ``reference_temperature_C``,
@@ -54,13 +57,25 @@ class Prior(StudyModel):
 
     magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
     direction_sd_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 1.0
-    common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    remanence_sd: dict[Material, Annotated[float, Field(ge=0.0, lt=1.0)]] = {}  # noqa: RUF012
     variation_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     variation_length_m: Length | None = None
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
     types: dict[Line, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}  # noqa: RUF012
     temperature_coefficient_per_K: RemanenceCoefficient | None = None
     reference_temperature_C: ReferenceTemperature | None = None
+
+    @property
+    def calibration_sd(self) -> float:
+        """That of the coil of measured blocks, of which a data sheet says nothing."""
+        return self.common_mode_sd or 0.0
+
+    @property
+    def shared_sd(self) -> float:
+        """The largest that blocks share which nobody has measured."""
+        return (max(self.remanence_sd.values(), default=0.0) if self.common_mode_sd is None
+                else self.common_mode_sd)
 
     @model_validator(mode="after")
     def _consistent(self) -> Prior:

@@ -17,9 +17,10 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
-from halbach_fe.study.array import Array, common_material, remanence_sd
+from halbach_fe.study.array import Array, common_material, remanence_sds
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
 from halbach_fe.study.grades import grade, grade_of
 from halbach_fe.study.inference import (
@@ -167,8 +168,8 @@ class Study(StudyModel, metaclass=_OfKeys):
             return given
         values = dict(given)
         prior = values.get("prior", {})
-        if isinstance(prior, dict) and (sd := remanence_sd(array)) is not None:
-            values["prior"] = {"common_mode_sd": sd} | prior
+        if isinstance(prior, dict) and prior.get("common_mode_sd") is None:
+            values["prior"] = {"remanence_sd": remanence_sds(array)} | prior
         demagnetization = values.get("demagnetization")
         if isinstance(demagnetization, dict):
             values["demagnetization"] = found.demagnetization_defaults | demagnetization
@@ -180,13 +181,16 @@ class Study(StudyModel, metaclass=_OfKeys):
         What the grade of the array says about prior and demagnetization follows another grade.
         """
         changed = super().with_(**changes)
-        old, new = grade_of(self.array), grade_of(changed.array)
-        if old is None or new is None or new is old:
-            return changed
         tables: dict[str, Any] = {}
-        if self.prior.common_mode_sd == changed.prior.common_mode_sd == old.remanence_sd:
-            tables["prior__common_mode_sd"] = new.remanence_sd
-        if found := changed.demagnetization:
+        known, named = self.prior.remanence_sd, {name for name, _ in self.array.grades}
+        if (changed.array.grades != self.array.grades and changed.prior.remanence_sd == known
+                and (known or not any(named))):  # else all strengths were stated
+            tables["prior__remanence_sd"] = {
+                name: known.get(name, grade(name).remanence_sd)
+                for name, is_of_grade in changed.array.grades
+                if name and (name in known or (is_of_grade and name not in named))}
+        old, new = grade_of(self.array), grade_of(changed.array)
+        if (found := changed.demagnetization) and old and new and new is not old:
             given = {key: value for key, value in dict(found).items()
                      if old.demagnetization_defaults.get(key) != value}
             tables["demagnetization"] = new.demagnetization_defaults | given
@@ -294,6 +298,17 @@ class Study(StudyModel, metaclass=_OfKeys):
             own_name(name): value for name, value in each.change.items()
             if value and own_name(name)})]
         return type(self).model_validate(values | own | {"maps": (), "uncertain": uncertain})
+
+    @property
+    def shared_sds(self) -> Floats:
+        """Standard deviations (blocks, k) of k independent deviations that blocks share, relative
+        to nominal: one of all blocks, or one of those of each grade.
+        """
+        prior, grades = self.prior, self.array.grades
+        if prior.common_mode_sd is not None or not prior.remanence_sd:
+            return np.full((len(grades), 1), prior.calibration_sd)
+        return np.array([[sd * (own == name) for name, sd in prior.remanence_sd.items()]
+                         for own, _ in grades])
 
     def demagnetization_of(self, material: str | None) -> Demagnetization:
         """Return what blocks of a grade withstand, by the name of the grade.

@@ -189,10 +189,12 @@ def simulate_campaign(
         magnitude)
     if elements not in (None, Elements()) and not magnet.is_vacuum and by_elements(magnet):
         _warn_of_elements(magnet, points, elements, float(np.nanmin(sigma)))
+    common = drawn.common.tolist()
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "effects": [effect.plain() for effect in hidden],
-        "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
+        "common_mode": common[0] if len({*common}) == 1 else common,
+        "coil_calibration": calibration, "coil_sd": coil_sd,
         "noise_free": {"largest_T": float(np.linalg.norm(readings, axis=1).max()),
                        "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
         "blocks": magnetizations(mounted),
@@ -484,8 +486,9 @@ class DrawnMagnet:
     """The blocks before they are mounted."""
     turns: tuple[Rotation, ...]
     """Error of the mounting in each place, along the magnet's axes."""
-    common: float
-    """Deviation that all magnetizations have in common, relative to the nominal."""
+    common: Floats
+    """Deviation that every magnetization has in common with others, relative to the nominal.
+    Shape (blocks,)."""
 
     @property
     def mounted(self) -> TrueMagnet:
@@ -498,15 +501,16 @@ class DrawnMagnet:
 def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
     """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
     prior = study.prior
-    common = float(prior.common_mode_sd * generator.standard_normal())
+    shared = study.shared_sds
+    common = (shared * generator.standard_normal(shared.shape[1])).sum(axis=1)
     single, turns = [], []
-    for body in nominal.bodies:
+    for body, together in zip(nominal.bodies, common, strict=True):
         deviation = generator.standard_normal(3) * [
             prior.magnitude_sd, *2 * [np.radians(prior.direction_sd_deg)]]
         turn = np.radians(prior.mounting_sd_deg) * generator.standard_normal(3)
         if study.dimension == 2:
             deviation[2] = turn[0] = turn[1] = 0.0
-        single.append(_deviating(body, deviation + np.array([common, 0.0, 0.0])))
+        single.append(_deviating(body, deviation + np.array([together, 0.0, 0.0])))
         turns.append(Rotation.from_rotvec(turn))
     return DrawnMagnet(replace(nominal, bodies=tuple(single)), tuple(turns), common)
 
@@ -551,7 +555,7 @@ def coil_table(
     -------
     table : BlockTable
     calibration : float
-        Relative error of the coil, drawn with the standard deviation ``prior.common_mode_sd``. It
+        Relative error of the coil, drawn with the standard deviation ``prior.calibration_sd``. It
         is the same for all blocks, whose moments are measured too small if it is positive.
     """
     length = study.array.ring_length_m or study.array.outer_radius_m  # of infinite blocks
@@ -562,7 +566,7 @@ def coil_table(
     bodies = _before_mounting(nominal, there.values())
     true = moments(_before_mounting(single, there.values()), length)
     sigma = coil_sd * np.linalg.norm(moments(bodies, length), axis=1)
-    calibration = float(study.prior.common_mode_sd * generator.standard_normal())
+    calibration = float(study.prior.calibration_sd * generator.standard_normal())
     measured = true / (1 + calibration) + sigma[:, None] * generator.standard_normal(true.shape)
     # the last digits differ from solve to solve
     digits = 10 - int(np.log10(np.abs(measured).max()))

@@ -300,11 +300,12 @@ def true_axis(campaign: SimulatedCampaign, magnet: Magnet) -> list[float]:
     Circles and definitions are those of `halbach_fe.response.magnetic_axis`.
     """
     order, flat = magnet.array.multipole_order, magnet.dimension == 2
+    middle = magnet.middle_z_m
     heights = np.zeros(1) if flat else np.linspace(-1, 1, HEIGHTS) * (
-        LENGTH * magnet.array_half_length)
+        LENGTH * (magnet.array_half_length - abs(middle)))  # from the middle
     count, radius = 2 * (order + 2), RADIUS * magnet.bore_radius
     turns = 2 * np.pi * np.arange(count) / count
-    points = np.array([[radius * np.cos(turn), radius * np.sin(turn), z]
+    points = np.array([[radius * np.cos(turn), radius * np.sin(turn), middle + z]
                        for z in heights for turn in turns])
 
     field, nominal = (true_field(source, points).reshape(len(heights), count, 3)

@@ -20,6 +20,7 @@ from scipy.stats import qmc
 
 from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.design.tolerance import assembled_prior
 from halbach_fe.geometry.array_layout import blocks_of_table
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
@@ -44,6 +45,7 @@ from halbach_fe.stats.small_samples import (
     predictive_covariance,
     shrunk_covariance,
 )
+from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic import bodies
 from halbach_fe.synthetic.magpylib_field import vacuum_field
@@ -532,6 +534,32 @@ def test_prior_is_calibrated(vacuum_dipole, generator, copies):
     # 30 gains, each in a third of the variance: sd about 5 %
     assert rms == pytest.approx(1.0, abs=0.2)
     assert np.sqrt(2) * rms != pytest.approx(1.0, abs=0.2)
+
+
+def test_a_data_sheet_says_nothing_of_the_coil(short_dipole):
+    """The range of N52 counted as the calibration of the coil: blocks measured to 0.1 % were known
+    to 1.2 %. Controls: a calibration that the study states, and the magnet without a table.
+    """
+    graded, stated = (short_dipole(array__recoil_permeability=1.0, array__material="N52",
+                                   array__remanence_T=own, prior={}) for own in (None, 1.44))
+    range_sd = grade("N52").remanence_sd
+    assert range_sd > 0.01
+    for study, sd in ((graded, 1e-3), (stated, 1e-3),
+                      (graded.with_(prior__common_mode_sd=0.02), np.hypot(1e-3, 0.02))):
+        magnet = build_magnet(study)
+        mean = np.array([block.magnetization for block in magnet.blocks])
+        size = np.linalg.norm(mean[0])
+        table = table_of(study, [block.slot for block in magnet.blocks], mean,
+                         [block.ring for block in magnet.blocks],
+                         sigma=np.full(len(mean), 1e-3 * size * VOLUME))
+        along = np.zeros((1, mean.size))
+        along[0, :3] = mean[0] / size**2
+        found = prior_from_blocks(magnet, table).gaussian
+        assert found.sd_of(along)[0] == pytest.approx(sd, rel=1e-6)
+        before = assembled_prior(magnet, mean.ravel()).sd_of(along)[0]
+        shared = {"N52": range_sd} if study.array.remanence_T == 1.45 else {}
+        assert study.prior.remanence_sd == shared
+        assert before == pytest.approx(np.hypot(0.01, study.prior.shared_sd), rel=1e-6)
 
 
 def test_placed_prior_is_calibrated(vacuum_dipole, generator):

@@ -17,11 +17,19 @@ from scipy.stats import qmc
 from halbach_fe.api import homogeneity
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.magnets import halbach_ring
+from halbach_fe.magnets import halbach_ring, magnet_of_blocks
+from halbach_fe.report.homogeneity import answer
 from halbach_fe.report.page import write_report
 from halbach_fe.response.homogeneity import extremes, real_harmonics
-from halbach_fe.response.region import SURFACE_DEGREE, Region, region_points, sphere_points
+from halbach_fe.response.region import (
+    SURFACE_DEGREE,
+    Region,
+    default_region,
+    region_points,
+    sphere_points,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
@@ -388,6 +396,22 @@ def test_harmonics_are_the_derivatives_at_the_centre(generator, tmp_path):
         1 + 0.01 * generator.standard_normal((len(nominal), 1, 50))))
     assert max(each.sd_ppm for each in alike.harmonics) < 1e-6 * largest
     assert max(each.sd_ppm for each in apart.harmonics) > 1e-4 * largest
+
+
+def test_the_region_of_a_magnet_away_from_the_origin(tmp_path):
+    """It was about the origin, 0.3 m away, in the fringe field of free blocks. Control: there."""
+    ring = ring_of_cubes()
+    blocks = {name: values for name, values in blocks_table(ring).items()
+              if name not in ("ring", "slot")}
+    there = magnet_of_blocks(blocks | {"z_m": np.array(blocks["z_m"]) + 0.3})
+    session = Session.open(tmp_path)
+    here, found = (homogeneity(magnet, session) for magnet in (ring, there))
+    for name in ("mean_T", "rms_ppm", "peak_to_peak_ppm"):
+        assert getattr(found.by_name["prior"], name) == pytest.approx(
+            getattr(here.by_name["prior"], name), rel=1e-6)
+    assert "about (0, 0, 300) mm" in answer(found).question
+    before = homogeneity(there, session, default_region(ring)).by_name["prior"]
+    assert before.mean_T < 0.1 * here.by_name["prior"].mean_T
 
 
 def test_mean_squares_of_harmonics():

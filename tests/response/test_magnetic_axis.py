@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.core.errors import MeasurementError
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -182,6 +183,35 @@ def test_the_centre_of_blocks_that_deviate_is_where_the_field_is_stationary(gene
     # half a turn about z reverses a dipole: slot k comes to slot k + 6
     turned = deviating.reshape(3, 2, 6, 3)[:, ::-1].reshape(3, 12, 3) * [-1, -1, 1]
     assert centre(-turned.ravel()) == pytest.approx(found * [-1, -1, 1], abs=1e-9)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_magnet_has_the_same_axis_wherever_it_lies(generator, tmp_path, order):
+    """Heights and sphere were about z = 0, beside free blocks 0.3 m away: the roll was another, the
+    slopes those of the fringe field, and a dipole had no centre. Control: other blocks.
+    """
+    away = 0.3  # m
+    ring = hf.halbach_ring(order=order, blocks=8, inner_radius_m=0.02, outer_radius_m=0.05,
+                           length_m=0.06, rings=2)
+    blocks = {name: values for name, values in blocks_table(ring).items()
+              if name not in ("ring", "slot")}
+    here, there = (hf.magnet_of_blocks(blocks | {"z_m": np.array(blocks["z_m"]) + z}, order=order)
+                   for z in (0.0, away))
+    nominal = here.nominal_magnetization
+    errors = 1e-3 * np.abs(nominal).max() * generator.standard_normal((2, len(nominal)))
+
+    def axis(magnet, own):
+        found = magnetic_axis(magnet, Session.open(tmp_path), Gaussian(
+            nominal + own, errors[0].std() * np.eye(len(nominal))))
+        return np.hstack([found.centre_m, found.slope_rad or [], found.roll_rad,
+                          found.centre_sd_m, found.slope_sd_rad or [], found.roll_sd_rad])
+
+    found, moved = axis(here, errors[0]), axis(there, errors[0])
+    if order == 1:
+        moved[2] -= away
+    rounding = 1e-6
+    assert moved == pytest.approx(found, rel=rounding, abs=rounding * 1e-3)
+    assert moved != pytest.approx(axis(here, errors[1]), rel=0.1)
 
 
 @pytest.mark.parametrize(("share", "there"), [(1e-4, True), (0.3, False)])

@@ -270,7 +270,7 @@ def test_contraction_by_block(generator):
 
 def test_block_prior_along_and_across(generator):
     nominal = np.array([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])
-    prior = nominal_prior(nominal, 3, magnitude_sd=0.01, direction_sd_deg=1.0, common_mode_sd=0.02)
+    prior = nominal_prior(nominal, 3, magnitude_sd=0.01, direction_sd_deg=1.0, shared_sds=0.02)
     covariance = prior.covariance
     along = np.array([0.6, 0.8, 0.0])
     block = covariance[:3, :3]

@@ -58,20 +58,20 @@ CUBES = {"name": ["a", "b"], "shape": ["cuboid"] * 2, "x_m": [0.04, -0.04], "y_m
          "z_m": [0.0] * 2, **{f"size_{axis}_m": [0.02] * 2 for axis in "xyz"}}
 
 
-@pytest.mark.parametrize(("array", "wide"), [
-    (RINGS | {"material": "N42", "rings": 2}, "N42"),
-    (RINGS | {"ring": [{"material": "N42"}] * 2}, "N42"),
-    (RINGS | {"ring": [{"material": "N42"}, {"material": "N48"}]}, "N48"),
-    (RINGS | {"material": "N42", "ring": [{}, {"material": "N48"}]}, "N48"),
-    ({"free_blocks": CUBES | {"material": ["N42", "N48"]}}, "N48"),
+@pytest.mark.parametrize(("array", "named"), [
+    (RINGS | {"material": "N42", "rings": 2}, ["N42"]),
+    (RINGS | {"ring": [{"material": "N42"}] * 2}, ["N42"]),
+    (RINGS | {"ring": [{"material": "N42"}, {"material": "N48"}]}, ["N42", "N48"]),
+    (RINGS | {"material": "N42", "ring": [{}, {"material": "N48"}]}, ["N42", "N48"]),
+    ({"free_blocks": CUBES | {"material": ["N42", "N48"]}}, ["N42", "N48"]),
     # negative controls: a strength that is stated is that of no range, and another one is not there
-    (RINGS | {"remanence_T": 1.3, "ring": [{}, {}]}, None),
-    (RINGS | {"ring": [{"material": "N42", "remanence_T": 1.3}] * 2}, None),
-    (RINGS | {"material": "N42", "remanence_T": 1.3}, None),
+    (RINGS | {"remanence_T": 1.3, "ring": [{}, {}]}, []),
+    (RINGS | {"ring": [{"material": "N42", "remanence_T": 1.3}] * 2}, []),
+    (RINGS | {"material": "N42", "remanence_T": 1.3}, []),
     (RINGS | {"remanence_T": 1.3, "free_blocks": CUBES | {
-        "remanence_T": [1.2] * 2, "material": ["N42"] * 2, "z_m": [0.1] * 2}}, None)])
-def test_what_blocks_of_a_grade_share_wherever_it_is_named(array: dict[str, Any], wide: str | None):
-    """The range of the remanence, of several grades the widest: N42 has 0.44 %, N48 0.82 %."""
+        "remanence_T": [1.2] * 2, "material": ["N42"] * 2, "z_m": [0.1] * 2}}, [])])
+def test_what_blocks_of_a_grade_share_wherever_it_is_named(array: dict[str, Any], named: list[str]):
+    """The range of the remanence: N42 has 0.44 %, N48 0.82 %. It is in the study's own file."""
     with warnings.catch_warnings(action="ignore", category=HalbachWarning):
         study = parse_study({
             "name": "graded", "mesh": {"block_size_m": 0.02}, "array": array, "observation": {
@@ -79,7 +79,10 @@ def test_what_blocks_of_a_grade_share_wherever_it_is_named(array: dict[str, Any]
                 "positions": {"kind": "points", "points_m": [[0, 0, 0]]}}})
     if "ring" not in array and "material" not in array and study.array.rings:
         assert study.array.recoil_permeability == 1.0  # not that of the free blocks' grade
-    assert study.prior.common_mode_sd == (0.0 if wide is None else grade(wide).remanence_sd)
+    assert study.prior.remanence_sd == {name: grade(name).remanence_sd for name in named}
+    assert study.prior.common_mode_sd is None
+    again = parse_study(study.model_dump(mode="json"))
+    assert again.prior == study.prior
 
 
 @pytest.mark.parametrize("name", list(grades()))
@@ -255,12 +258,15 @@ def test_another_grade_replaces_what_the_first_one_said():
     assert changed.array == told.array
     assert changed.array.remanence_T == 1.19
     assert changed.prior == told.prior
+    assert told.prior.remanence_sd == {"N35H": grade("N35H").remanence_sd}
+    weaker = told.with_(array__remanence_T=1.18)  # as an effect that is found, not as stated
+    assert weaker.prior == told.prior
     assert changed.demagnetization == told.demagnetization
     assert changed.demagnetization.squareness == 0.8  # the study's own
     own = study_with(material="N52", remanence_T=1.43).with_(array__recoil_permeability=1.02)
     kept = own.with_(array__material="N50M")  # 1.43 T is in the range of both
     assert (kept.array.remanence_T, kept.array.recoil_permeability) == (1.43, 1.02)
-    assert kept.prior.common_mode_sd == own.prior.common_mode_sd
+    assert kept.prior.remanence_sd == own.prior.remanence_sd == {}
     both = study_with(material="N52").with_(array__material="N35H", array__remanence_T=1.2)
     assert both.array.remanence_T == 1.2
 

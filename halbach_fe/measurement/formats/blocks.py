@@ -2,8 +2,10 @@
 
 A table with positions becomes one of free blocks (`halbach_fe.study.free_blocks`), any other one of
 measured blocks (`halbach_fe.measurement.block_table`). The strength of a block may be its moment,
-its polarization J, or its magnetization M; with the volume each follows from the others. As for
-maps, nothing is guessed, and one message lists all that is missing.
+its polarization J, its magnetization M, or its remanence B_r. A coil measures the moment of a lone
+block, m = V M = V J / mu_0, in its own demagnetizing field; that is not that of its B_r, see
+`remanence_per_polarization`. The J and M of free blocks are those of programs, where J = B_r. As
+for maps, nothing is guessed, and one message lists all that is missing.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be, printable
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MU_0, in_a_row
-from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.geometry.array_layout import nominal_free_blocks
+from halbach_fe.measurement.block_table import REMANENT, BlockTable
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.text import (
@@ -38,14 +41,16 @@ from halbach_fe.measurement.formats.text import (
     uncommented,
 )
 from halbach_fe.measurement.instrument import to_magnet_axes
+from halbach_fe.solver.exact_block_field import remanence_per_polarization
+from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
-from halbach_fe.study.free_blocks import SIZES, FreeBlocks
+from halbach_fe.study.free_blocks import REMANENCE_VECTOR, SIZES, FreeBlocks
 from halbach_fe.study.free_blocks_file import outline_of, validated_blocks
 from halbach_fe.study.types import COMPONENTS
 
 TEXTS = ("serial", "type", "ring", "slot", "shape", "material")
 VECTORS = {
-    "moment": "moment", "polarization": "field", "magnetization": "field"}
+    "moment": "moment", "polarization": "field", "magnetization": "field", "remanence": "field"}
 """Kind of the unit of each strength."""
 _WORDS = {
     "serial": "serial serialno serialnumber id blockid magnetid magnet block label name no nr "
@@ -54,7 +59,8 @@ _WORDS = {
     "shape": "shape geometry form", "material": "material grade", "volume": "volume vol v",
     "temperature": "temperature temp t", "sigma": "sigma sd std stdev uncertainty error",
     "moment": "moment magneticmoment m dipolemoment",
-    "polarization": "j br remanence polarization", "magnetization": "magnetization mag",
+    "polarization": "j polarization", "magnetization": "magnetization mag",
+    "remanence": "br remanence",
     "sides": "sides corners", "angle": "angle openingangle sectorangle",
     "radius": "radius", "inner_radius": "innerradius rin ri r1", "outer_radius":
     "outerradius rout ro r2", "inner_width": "innerwidth", "outer_width": "outerwidth"}
@@ -64,8 +70,8 @@ WORDS = {word: name for name, words in _WORDS.items() for word in words.split()}
                "{}centre", "{}c"),
         "size": ("size{}", "{}size", "d{}", "l{}", "dim{}", "length{}"),
         "rotation": ("rotation{}", "rot{}", "{}rot", "r{}", "rotvec{}"),
-        "moment": ("m{}", "moment{}"), "polarization": (
-            "j{}", "br{}", "remanence{}", "polarization{}", "b{}"),
+        "moment": ("m{}", "moment{}"), "polarization": ("j{}", "polarization{}"),
+        "remanence": ("br{}", "remanence{}", "b{}"),
         "magnetization": ("magnetization{}", "mag{}")}.items() for spelling in spellings} | {
     "length": "size_x", "width": "size_y", "height": "size_z", "thickness": "size_z"}
 """Quantities by the names of columns, without spaces and marks, in lower case."""
@@ -360,8 +366,8 @@ def _missing(table: _Table, free: bool) -> list[str]:
         (not free and "serial" not in table,
          "the serial or name of each block (a column serial)"),
         (not strength and "material" not in table,
-         "its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., or "
-         "magnetization_x ...)"),
+         "its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., "
+         "magnetization_x ..., or remanence_x ...)"),
         (not free and strength in table.cells,
          f"the direction of its {strength} (a length alone does not: columns {strength}_x, "
          f"{strength}_y, {strength}_z along the axes of the block)"),
@@ -376,7 +382,10 @@ def _missing(table: _Table, free: bool) -> list[str]:
         (not free and "type" not in table and not {"ring", "slot"} <= set(table.cells),
          "ring and slot, or the type of the blocks (--fixed type=1)"),
         (bool(strength) and of_moment == free and "volume" not in table and not sizes,
-         "the volume (a column, or --fixed 'volume=12 cm^3')")]
+         "the volume (a column, or --fixed 'volume=12 cm^3')"),
+        (free and of_moment and not {"material", "recoil_permeability"} & table.cells.keys(),
+         "the recoil permeability, without which a moment is no remanence (a column, or --fixed "
+         "recoil_permeability=1.05)")]
     return [text for lacks, text in wanted if lacks] + _without_unit(table)
 
 
@@ -470,7 +479,7 @@ def _volume(table: _Table) -> Floats:
 def _measured_blocks(
     table: _Table, declared: DeclaredBlocks, attributes: Mapping[str, str]
 ) -> BlockTable:
-    """Return the table of measured blocks."""
+    """Return the table of measured blocks, whose shape, and moment of B_r, the study has."""
     strength = _strength(table)
     vectors = to_magnet_axes(declared.axes, table.vector(strength))
     volume = _volume(table)
@@ -492,7 +501,7 @@ def _measured_blocks(
         temperature = temperature - 273.15
     return BlockTable(tuple(table.cells["serial"]), tuple(table.cells.get("type", [""] * count)),
                       place["ring"], place["slot"], moment, sigma, volume, temperature,
-                      dict(attributes), table.where)
+                      {**attributes, **(REMANENT if strength == "remanence" else {})}, table.where)
 
 
 def _check_strength(polarization: Floats, strength: str, table: _Table) -> None:
@@ -585,6 +594,16 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
             for axis, values in zip(COMPONENTS, vectors.T, strict=True):
                 columns[f"remanence_{axis}_T"] = values.tolist()
     try:
-        return validated_blocks(columns, table.where)
+        found = validated_blocks(columns, table.where)
+        return _of_lone_blocks(found) if strength == "moment" else found
     except StudyError as error:
         raise MeasurementError(str(error)) from None
+
+
+def _of_lone_blocks(table: FreeBlocks) -> FreeBlocks:
+    """Return blocks with the B_r that each has, if it has the J of ``table`` on its own."""
+    blocks = nominal_free_blocks(Array.model_validate({"free_blocks": table}), 3)
+    remanences = [factor @ block.polarization for block, factor in zip(
+        blocks, remanence_per_polarization(blocks), strict=True)]
+    return table.model_copy(update={"remanence_T": (), **dict(zip(
+        REMANENCE_VECTOR, zip(*np.array(remanences).tolist(), strict=True), strict=True))})
