@@ -230,7 +230,8 @@ class IronRingEffect(Effect):
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
     refinements = (Parameter("farther_out", "m", 0.01, longest_step=0.005),
                    Parameter("thicker", "m", 0.005, longest_step=0.005),
-                   Parameter("higher_saturation", "T", 0.2))
+                   Parameter("higher_saturation", "T", 0.2),
+                   Parameter("more_permeable", "1", 0.7, longest_step=0.5))
     unique = True
     applied_in_full = True
 
@@ -260,29 +261,30 @@ class IronRingEffect(Effect):
         one was taken for a thin one that saturates, and stayed where the fit is best nearby.
         """
         return np.concatenate([self.rough_signature(nominal, place),
-                               self.refine(nominal, place, [1.0, 0.0, 0.0, 0.0])])
+                               self.refine(nominal, place, [1.0, *np.zeros(4).tolist()])])
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         here = nominal.solve(self.apply(nominal.study, place, values))
-        steps = (STEP_M, STEP_M, 0.1 * self.refinements[2].sd)
+        steps = (STEP_M, STEP_M, *(SHARE * one.sd for one in self.refinements[2:]))
         return np.array([(nominal.solve(self.apply(nominal.study, place, np.add(
             values, step * axis).tolist())) - here) / step
-            for step, axis in zip(steps, np.eye(4)[1:], strict=True)])
+            for step, axis in zip(steps, np.eye(5)[1:], strict=True)])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         clearance_m = 2e-4  # smallest distance between blocks and iron
         thinnest_m = 5e-4  # smallest thickness of a ring
         inner, outer = place.at_m
-        farther, thicker, higher = values[1:] or (0.0, 0.0, 0.0)
+        farther, thicker, higher, more = values[1:] or (0.0, 0.0, 0.0, 0.0)
         thickness = max(outer - inner + thicker, thinnest_m)
         inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
-        # Mild steels have polarizations of 2.0 to 2.15 T, cast iron 1.6 T. No other permeability
-        # is tried than one that is typical of both: a thin shield that is far from saturation acts
-        # by the product of permeability and thickness, and the thickness is varied.
+        # mild steels have polarizations of 2.0 to 2.15 T and permeabilities of 200 to 3000 where
+        # they are not saturated; cast iron has 1.6 T
         lowest_T, typical_T, highest_T = 1.2, 2.0, 2.5
+        least, typical = 0.1, 1000.0
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness, curve=FroehlichKennellyCurve(
-                kind="froehlich_kennelly", initial_relative_permeability=1000.0,
+                kind="froehlich_kennelly",
+                initial_relative_permeability=typical * max(1 + more, least),
                 saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))))
 
 
