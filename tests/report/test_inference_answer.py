@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.result import HELD_OUT, InferenceResult, far_in_words
+from halbach_fe.inference.result import HELD_OUT, Amplitudes, InferenceResult, far_in_words
 from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.words import flux_density, ppm
@@ -160,7 +160,7 @@ def test_amplitudes_that_were_moved_far(change, key, told):
 def test_amplitudes_have_the_unit_of_their_key(name, key, said):
     """By the unit at the end of the name, otherwise of the number that changes as they do."""
     def table(change):
-        found = SimpleNamespace(names=(name,), change=[-2.5], sd=[1.0], prior_sd=[10.0])
+        found = Amplitudes((name,), *(np.array([value]) for value in (-2.5, 1.0, 10.0)))
         return term_table(SimpleNamespace(
             terms=None, amplitudes=found, study=SimpleNamespace(
                 uncertain=[SimpleNamespace(name=name, change=change)])))[0]
