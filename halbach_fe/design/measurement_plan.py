@@ -159,7 +159,7 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     model = response_matrix(magnet, observation, session)
     beside = _beside(magnet, readings, one, field, model.shared_error)
     errors = readings.noise.with_independent_errors(model.error)
-    prior = study_prior(magnet, len(model.parameters) - len(magnet.parameter_names))
+    prior = study_prior(magnet, len(model.parameters))
     everything = joined(prior, *np.repeat([[0.0], [1.0]], beside.shape[1], axis=1))
     whole = np.hstack([model.whole, beside])
     size = len(observation) // len(points)  # readings per point; only these may be correlated

@@ -43,7 +43,14 @@ from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.moments.solve import solve_moments
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
+from halbach_fe.stats.gaussian import (
+    Gaussian,
+    block_diagonal_root,
+    nominal_prior,
+    root_matrix,
+    rotation_roots,
+    stacked_root,
+)
 from halbach_fe.study.inference import Uncertain, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
@@ -186,15 +193,31 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
 
 
-def study_prior(magnet: Magnet, count: int) -> Gaussian:
-    """Return the study's prior of all parameters in A/m, ``count`` of which are no magnetizations.
+def prior_of_blocks(magnet: Magnet) -> Gaussian:
+    """Return the study's prior of the magnetizations of an assembled magnet in A/m.
 
-    These are the amplitudes of variations, followed by uncertain amplitudes of the magnet.
+    It has the tolerances of the blocks, the errors that they share, and the random angles by which
+    blocks are turned when they are mounted.
     """
-    settings = magnet.study.prior
-    return with_others(nominal_prior(
-        magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, magnet.study.shared_sds), magnet, count)
+    settings, size, nominal = magnet.study.prior, magnet.dimension, magnet.nominal_magnetization
+    blocks = nominal_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
+                           magnet.study.shared_sds)
+    if not settings.mounting_sd_deg:
+        return blocks
+    turns = rotation_roots(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
+    return Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns)))
+
+
+def study_prior(magnet: Magnet, parameters: int, measured: Gaussian | None = None) -> Gaussian:
+    """Return the study's prior of all ``parameters`` of an assembled magnet in A/m.
+
+    After the magnetizations, whose prior ``measured`` blocks may have, are the amplitudes of
+    variations, followed by uncertain amplitudes of the magnet.
+    """
+    others = parameters - len(magnet.parameter_names)
+    prior = prior_of_blocks(magnet) if measured is None else measured
+    return with_amplitudes(with_variations(
+        prior, others - len(magnet.study.uncertain_of_magnet)), magnet)
 
 
 def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
@@ -204,12 +227,11 @@ def neighbour_modes(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], Float
     Each is that of one standard deviation of the study's prior of magnetizations. The blocks of a
     neighbour are others than this magnet's, and were not measured.
     """
-    settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
+    neighbours = magnet.study.external.neighbours
     if not neighbours:
         return []
-    root = sparse.csr_array(root_matrix(nominal_prior(
-        magnet.nominal_magnetization, 3, settings.magnitude_sd, settings.direction_sd_deg,
-        magnet.study.shared_sds).root)).toarray().reshape(len(magnet.blocks), 3, -1)
+    root = sparse.csr_array(root_matrix(prior_of_blocks(magnet).root)).toarray().reshape(
+        len(magnet.blocks), 3, -1)
     own = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks]) @ root
     return [(neighbour_blocks(magnet.blocks, (one,)),
              one.factor * rotation_about_z(np.radians(one.turn_deg)) @ own) for one in neighbours]
@@ -224,12 +246,6 @@ def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
             own += unit @ mode
         found.append(own)
     return np.moveaxis(np.concatenate(found, axis=2), -1, 0)
-
-
-def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
-    """Return a prior of magnetizations, and ``count`` other parameters, see `study_prior`."""
-    return with_amplitudes(with_variations(
-        prior, count - len(magnet.study.uncertain_of_magnet)), magnet)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:
