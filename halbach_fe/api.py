@@ -34,7 +34,6 @@ from halbach_fe.design.sorting import SortedBlocks, sort_blocks, sortable
 from halbach_fe.design.tolerance import (
     HomogeneityTolerance,
     Tolerance,
-    assembled_prior,
     predict_homogeneity,
     predict_tolerance,
 )
@@ -56,7 +55,7 @@ from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.files import WRITERS, export_map
 from halbach_fe.measurement.formats.files import import_map as read_foreign_map
 from halbach_fe.measurement.instrument import check_total_field
-from halbach_fe.response.block_variation import nominal_parameters
+from halbach_fe.response.block_variation import nominal_parameters, study_prior
 from halbach_fe.response.field_on_lines import FieldOnLines, Lines, field_on_lines
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel, homogeneity_model
 from halbach_fe.response.magnetic_axis import MagneticAxis
@@ -454,7 +453,7 @@ def multipoles(
         references = [replace(reference, z_m=None), replace(
             reference, z_m=magnet.middle_z_m if reference.z_m is None else reference.z_m)]
     models, left_out = multipole_models(magnet, references, session)
-    distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
+    distributions = known or {"prior": study_prior(magnet, len(models[0].nominal))}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
         for model in models], disagreement_of(posterior, magnet), left_out)
@@ -499,7 +498,7 @@ def field(
     >>> bool(sd[0, 0] > 0)
     True
     """
-    known = (assembled_prior(magnet, nominal_parameters(magnet)) if posterior is None
+    known = (study_prior(magnet, len(nominal_parameters(magnet))) if posterior is None
              else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
     most, nothing_T = 0.01, 1e-12  # a smaller field is rounding, as on the axis of a quadrupole
@@ -559,7 +558,7 @@ def homogeneity(
     known = None if posterior is None else distributions_of(magnet, posterior)
     check_number("degrees", "homogeneity", degrees, 1, HIGHEST_DEGREE, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
-    distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
+    distributions = known or {"prior": study_prior(magnet, len(model.response.nominal))}
     of_map, misfit, remarks = ({}, 1.0, ()) if data is None else map_homogeneity(
         magnet, data, model)
     by_name = {name: model.of(distribution, measured=name != "prior")
@@ -802,7 +801,7 @@ def tolerance(
     check_objective(magnet, reference, limit_units, limit_ppm)
     measured = None if blocks is None else prior_from_blocks(magnet, blocks)
     model, generator = objective_of(magnet, reference, session), np.random.default_rng(seed)
-    prior = assembled_prior(magnet, model.nominal, measured.gaussian if measured else None)
+    prior = study_prior(magnet, len(model.nominal), measured.gaussian if measured else None)
     found = (predict_tolerance(model, magnet, prior, draws, generator, limit_units)
              if isinstance(model, MultipoleModel) else
              predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm))

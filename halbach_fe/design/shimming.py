@@ -466,7 +466,7 @@ def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:
     """
     study, after = result.study, result.posterior
     sd, root = np.radians(study.prior.mounting_sd_deg), np.asarray(after.root)
-    if not sd or result.measured_blocks is None:  # the prior has no mounting errors
+    if not sd:  # the prior has no mounting errors
         return after.mean, root, root
     before = result.prior
     turns = linalg.block_diag(*_turn_covariance(

@@ -37,7 +37,6 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
-from halbach_fe.design.tolerance import assembled_prior
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import (
@@ -49,6 +48,7 @@ from halbach_fe.inference.block_prior import (
     with_types,
 )
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.response.multipoles import MultipoleModel
 from halbach_fe.stats.gaussian import Gaussian
@@ -292,7 +292,7 @@ def _assembled(magnet: Magnet, placed: BlockTable, model: Objective) -> Gaussian
 
     It has the uncertainty of the measured moments, of the coil's calibration and of the mounting.
     """
-    return assembled_prior(magnet, model.nominal, prior_from_blocks(magnet, placed).gaussian)
+    return study_prior(magnet, len(model.nominal), prior_from_blocks(magnet, placed).gaussian)
 
 
 def present(magnet: Magnet) -> Ints:

@@ -16,16 +16,9 @@ import scipy.linalg as linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.block_variation import with_neighbours, with_others
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles
-from halbach_fe.stats.gaussian import (
-    Gaussian,
-    block_diagonal_root,
-    nominal_prior,
-    rotation_roots,
-    stacked_root,
-)
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 
 QUANTILES = (0.05, 0.5, 0.95, 0.99)
@@ -147,36 +140,6 @@ class HomogeneityTolerance(DrawnMagnets):
     def largest(self) -> Floats:
         """The rms deviation of each magnet in ppm, (draws,)."""
         return self.rms_ppm
-
-
-def assembled_prior(
-    magnet: Magnet, nominal: Floats, measured: Gaussian | None = None
-) -> Gaussian:
-    """Return the study's prior of all parameters of assembled magnets.
-
-    It has the tolerances of the blocks, the error that they share, the random angles by which
-    blocks are turned when they are mounted, and what else the study has as uncertain; beside these
-    what the blocks of neighbours deviate.
-
-    Parameters
-    ----------
-    magnet : Magnet
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetizations, and 0 for variations inside blocks and uncertain amplitudes.
-    measured : Gaussian, optional
-        Prior of the magnetizations of measured blocks, which replaces the study's.
-    """
-    settings, size = magnet.study.prior, magnet.dimension
-    uniform = nominal[:size * len(magnet.blocks)]
-    if measured is not None:
-        return with_neighbours(
-            magnet, with_others(measured, magnet, len(nominal) - len(uniform)))
-    blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
-                           magnet.study.shared_sds)
-    turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return with_neighbours(magnet, with_others(
-        Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),
-        magnet, len(nominal) - len(uniform)))
 
 
 def predict_tolerance(

@@ -59,8 +59,6 @@ from halbach_fe.response.block_variation import (
     neighbour_parameters,
     study_prior,
     with_magnetizations,
-    with_neighbours,
-    with_others,
 )
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
@@ -368,10 +366,8 @@ class _Search:
         """Return the prior of the ``parameters`` of the blocks, with neighbours' blocks beside."""
         if self.prior is not None:
             return self.prior
-        others = parameters - len(self.magnet.parameter_names)
-        return with_neighbours(self.magnet, study_prior(
-            self.magnet, others) if self.of_blocks is None else with_others(
-                self.of_blocks.gaussian, self.magnet, others))
+        measured = None if self.of_blocks is None else self.of_blocks.gaussian
+        return study_prior(self.magnet, parameters, measured)
 
     def _beside(
         self, readings: Readings

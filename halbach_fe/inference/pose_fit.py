@@ -224,7 +224,7 @@ class PoseFit:
         sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
         deviations = Deviations.of(magnet)
         if blocks is None:
-            blocks = study_prior(magnet, deviations.count - len(magnet.parameter_names))
+            blocks = study_prior(magnet, deviations.count)
         return cls(magnet, points, np.nan_to_num(readings), data, training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
                    session, probe, base, open_keys, pose.sd(magnet), pose.stage is not None,

@@ -45,8 +45,10 @@ from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import (
     Gaussian,
+    block_diagonal_root,
     nominal_prior,
     root_matrix,
+    rotation_roots,
     stacked_root,
     with_independent,
 )
@@ -192,15 +194,32 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
 
 
-def study_prior(magnet: Magnet, count: int) -> Gaussian:
-    """Return the study's prior of all parameters in A/m, ``count`` of which are no magnetizations.
+def prior_of_blocks(magnet: Magnet) -> Gaussian:
+    """Return the study's prior of the magnetizations of an assembled magnet in A/m.
 
-    These are the amplitudes of variations, followed by uncertain amplitudes of the magnet.
+    It has the tolerances of the blocks, the errors that they share, and the random angles by which
+    blocks are turned when they are mounted.
     """
-    settings = magnet.study.prior
-    return with_others(nominal_prior(
-        magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, magnet.study.shared_sds), magnet, count)
+    settings, size, nominal = magnet.study.prior, magnet.dimension, magnet.nominal_magnetization
+    blocks = nominal_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
+                           magnet.study.shared_sds)
+    if not settings.mounting_sd_deg:
+        return blocks
+    turns = rotation_roots(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
+    return Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns)))
+
+
+def study_prior(magnet: Magnet, parameters: int, measured: Gaussian | None = None) -> Gaussian:
+    """Return the study's prior of all ``parameters`` of an assembled magnet in A/m.
+
+    After the magnetizations, whose prior ``measured`` blocks may have, are the amplitudes of
+    variations, followed by uncertain amplitudes of the magnet; beside all of these is what the
+    blocks of neighbours deviate.
+    """
+    others = parameters - len(magnet.parameter_names)
+    prior = prior_of_blocks(magnet) if measured is None else measured
+    return with_neighbours(magnet, with_amplitudes(with_variations(
+        prior, others - len(magnet.study.uncertain_of_magnet)), magnet))
 
 
 def neighbour_prior(magnet: Magnet) -> Gaussian:
@@ -209,10 +228,8 @@ def neighbour_prior(magnet: Magnet) -> Gaussian:
     They are Mx, My and Mz of the blocks of every neighbour, along the axes of this magnet before it
     is moved there. These blocks are others than this magnet's, and were not measured.
     """
-    settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
-    root = sparse.csr_array(root_matrix(nominal_prior(
-        magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, magnet.study.shared_sds).root))
+    neighbours = magnet.study.external.neighbours
+    root = sparse.csr_array(root_matrix(prior_of_blocks(magnet).root))
     return Gaussian(np.zeros(neighbour_parameters(magnet)), stacked_root(
         sparse.csr_array(sparse.kron(sparse.eye_array(len(neighbours)), root))))
 
@@ -251,12 +268,6 @@ def neighbour_columns(magnet: Magnet, points: Floats) -> Floats:
     return np.concatenate([np.zeros((*points.shape, 0)), *(
         unit @ matrix for blocks, matrices in neighbour_remanences(magnet)
         for unit, matrix in zip(unit_fields(blocks, points), matrices, strict=True))], axis=2)
-
-
-def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
-    """Return a prior of magnetizations, and ``count`` other parameters, see `study_prior`."""
-    return with_amplitudes(with_variations(
-        prior, count - len(magnet.study.uncertain_of_magnet)), magnet)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:

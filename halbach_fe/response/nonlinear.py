@@ -38,6 +38,7 @@ from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.block_variation import prior_of_blocks
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.dofs import check_difference, factorize
@@ -52,7 +53,7 @@ from halbach_fe.solver.routes import (
     vacuum_part,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0, ConstitutiveLaw
 from halbach_fe.study.model import iron_of
 
@@ -133,9 +134,7 @@ def nonlinear_model(
     error = _error(magnet, observation, session)
     model = NonlinearModel(condensed, linear.offset, magnet.parameter_names, linear.nominal, error,
                            np.nan)
-    settings = magnet.study.prior
-    prior = prior or nominal_prior(linear.nominal, magnet.dimension, settings.magnitude_sd,
-                                   settings.direction_sd_deg, magnet.study.shared_sds)
+    prior = prior or prior_of_blocks(magnet)
     # number of magnetizations for which the model is compared with GetDP's Newton method
     verified_samples = 3
     samples = prior.sample(verified_samples, generator)

@@ -45,14 +45,15 @@ class Prior(StudyModel):
     and those of two places of a block at the distance d have the correlation
     ``exp(-d^2 / (2 variation_length_m^2))``. In 3D and without iron only.
 
-    The other keys concern a block table, the measured moments of the single blocks (see
-    `halbach_fe.measurement.block_table`). With a block table, the measured moments replace
-    ``magnitude_sd``, ``direction_sd_deg`` and ``remanence_sd``; ``common_mode_sd`` still applies.
     ``mounting_sd_deg`` is the standard deviation of the rotation of a mounted block about each
-    axis. ``types`` lists the slots of every block type; by default every slot is a type of its own,
-    labelled by its number. With ``temperature_coefficient_per_K`` and ``reference_temperature_C``,
-    moments are corrected to the reference temperature by
-    ``m(T) = m(T_ref) (1 + coefficient (T - T_ref))``.
+    axis.
+
+    With a block table, the measured moments of the single blocks (see
+    `halbach_fe.measurement.block_table`), these replace ``magnitude_sd``, ``direction_sd_deg`` and
+    ``remanence_sd``; ``common_mode_sd`` and ``mounting_sd_deg`` still apply. ``types`` lists the
+    slots of every block type; by default every slot is a type of its own, labelled by its number.
+    With ``temperature_coefficient_per_K`` and ``reference_temperature_C``, moments are corrected to
+    the reference temperature by ``m(T) = m(T_ref) (1 + coefficient (T - T_ref))``.
     """
 
     magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01

@@ -109,7 +109,7 @@ def fit(
     sigma_T, position_sd_m : float
         Noise of a reading, and of its position.
     """
-    root = root_matrix(study_prior(magnet, 0).root)
+    root = root_matrix(study_prior(magnet, len(magnet.parameter_names)).root)
     root = root if isinstance(root, np.ndarray) else root.toarray()
     array = magnet.array
     assert array.ring_length_m is not None

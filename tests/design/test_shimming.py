@@ -107,8 +107,9 @@ def shimmed_magnets(study, session, with_blocks, **options):
 
 
 @pytest.mark.parametrize(("changes", "with_blocks"), [
-    ({}, False), (SQUARES, False), (SQUARES | {"prior__mounting_sd_deg": 0.25}, True)],
-    ids=["sectors", "squares", "squares that are mounted anew"])
+    ({}, False), (SQUARES, False), (SQUARES | {"prior__mounting_sd_deg": 0.25}, True),
+    (SQUARES | {"prior__mounting_sd_deg": 0.25}, False)],
+    ids=["sectors", "squares", "squares that are mounted anew", "without a table of blocks"])
 def test_the_shimmed_magnet_is_as_foretold(session, changes, with_blocks):
     """20 magnets of 8 multipoles: chi2 per number is 1 +- 0.11 (sqrt(2/160)); three of that."""
     study = study_of(**changes)

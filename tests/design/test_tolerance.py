@@ -7,10 +7,11 @@ import pytest
 import scipy.stats as stats
 
 import halbach_fe as hf
-from halbach_fe.design.tolerance import assembled_prior, predict_tolerance
+from halbach_fe.design.tolerance import predict_tolerance
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
@@ -69,7 +70,7 @@ def drawn(session, prior=PRIOR, **options):
     study = study_of(prior=prior)
     model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     return predict_tolerance(model, build_magnet(study),
-                             assembled_prior(build_magnet(study), model.nominal), 20_000,
+                             study_prior(build_magnet(study), len(model.nominal)), 20_000,
                      np.random.default_rng(1), **options)
 
 
@@ -123,7 +124,7 @@ def test_blocks_of_two_grades_deviate_by_themselves():
                 "positions": {"kind": "points", "points_m": [[0, 0, 0]]}}})
         magnet = build_magnet(study)
         nominal = magnet.nominal_magnetization
-        prior = assembled_prior(magnet, nominal)
+        prior = study_prior(magnet, len(nominal))
         of_blocks = nominal.reshape(-1, 3) / np.sum(nominal.reshape(-1, 3)**2, axis=1)[:, None]
         rows = np.repeat(np.eye(3) / 8, 8, axis=1)[:, :, None] * of_blocks  # means of rings
         rows = rows.reshape(3, -1)

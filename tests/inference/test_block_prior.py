@@ -20,7 +20,6 @@ from scipy.stats import qmc
 
 from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
-from halbach_fe.design.tolerance import assembled_prior
 from halbach_fe.geometry.array_layout import blocks_of_table
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
@@ -33,6 +32,7 @@ from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.report.page import write_files
 from halbach_fe.report.prior import answer, page
 from halbach_fe.report.tolerance import answer as tolerance_answer
+from halbach_fe.response.block_variation import study_prior
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.solver.ring_harmonics_2d import (
     SectorMagnetization,
@@ -556,7 +556,7 @@ def test_a_data_sheet_says_nothing_of_the_coil(short_dipole):
         along[0, :3] = mean[0] / size**2
         found = prior_from_blocks(magnet, table).gaussian
         assert found.sd_of(along)[0] == pytest.approx(sd, rel=1e-6)
-        before = assembled_prior(magnet, mean.ravel()).sd_of(along)[0]
+        before = study_prior(magnet, mean.size).sd_of(along)[0]
         shared = {"N52": range_sd} if study.array.remanence_T == 1.45 else {}
         assert study.prior.remanence_sd == shared
         assert before == pytest.approx(np.hypot(0.01, study.prior.shared_sd), rel=1e-6)
