@@ -71,9 +71,12 @@ def _refusal(name: str, where: str, value: object, hint: Any) -> MeasurementErro
     wanted = _kinds(hint)
     text = isinstance(value, str) and "a number" in wanted
     refusal = MeasurementError if "a Dataset" in wanted else StudyError
+    kind = type(value).__name__
+    if isinstance(value, list | tuple):  # of which an element may be wrong
+        kind += next((f" of {type(one).__name__}" for one in value if not _fits([one], hint)), "")
     return refusal(must_be(
         name, where, " or ".join(wanted),
-        repr(value) if text else value if isinstance(value, Real) else f"a {type(value).__name__}",
+        repr(value) if text else value if isinstance(value, Real) else f"a {kind}",
         ONCE if isinstance(value, Iterator) and any(one.startswith("a list") for one in wanted) else
         "Take float() of it." if isinstance(value, Fraction) and "a number" in wanted else
         READERS.get(wanted[0].split()[-1], "")))

@@ -161,7 +161,7 @@ class FreeBlocks(StudyModel):
         max_places, max_places_per_block = 1_000_000, 100
         if self.file is not None:
             raise ValueError("the file has not been read; use read_study, which reads it")
-        if not len(self):
+        if not any(getattr(self, column) for column in COLUMNS):
             raise ValueError("there is no block; give a file, or columns")
         for column in COLUMNS:
             values = getattr(self, column)

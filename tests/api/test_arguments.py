@@ -83,10 +83,11 @@ def test_what_is_taken(right):
     ({"number": True}, "instead received True"), ({"number": None}, "a NoneType"),
     ({"number": Fraction(1, 50)}, r"a number; instead received 1/50. Take float\(\) of it"),
     ({"number": 10**400}, "must be a number"), ({"number": np.ones(2)}, "a ndarray"),
-    ({"flag": 1}, "must be True or False; instead received 1"), ({"names": [1]}, "a list"),
+    ({"flag": 1}, "must be True or False; instead received 1"),
+    ({"names": [1]}, "instead received a list of int"),
     ({"names": 3}, "must be a list of text; instead received 3"),
     ({"several": {"a": 1}}, r"must be a list of numbers; .* a dict"),
-    ({"several": ["a"]}, "must be a list"),
+    ({"several": ["a"]}, "must be a list of numbers; instead received a list of str"),
     ({"names": (one for one in "ab")}, "a generator. It can be read only once; make a list"),
     ({"several": iter([1])}, "must be a list"), ({"names": map(str, [1])}, "make a list of it")])
 def test_what_is_not_taken(wrong, said):

@@ -47,12 +47,13 @@ def test_every_shape_needs_its_own_sizes_and_no_others(shape):
 
 
 @pytest.mark.parametrize(("columns", "said"), [
-    ({"name": []}, "there is no block"),
+    ({"name": []}, "there is no column name: add it"),
     ({"name": ["b1", "b1"]}, "name must be unique to a block, but b1 occurs twice"),
     ({"name": ["b1", "b 2"]}, "should match pattern"),
     ({"x_m": [0.0]}, "column x_m has 1 rows, and there are 2 names"),
     ({"z_m": None}, "there is no column z_m: add it"),
     ({"shape": None}, "there is no column shape: add it"),
+    ({"name": None}, "there is no column name: add it"),
     ({"x_m": [None, None]}, "column x_m has no value: give it, as every block needs name"),
     ({"shape": ["cuboid", "sphere"]}, "'cuboid', 'sector'"),
     ({"ring": [1, 1]}, "ring and slot together"),
@@ -72,6 +73,11 @@ def test_refusals(columns, said):
     with pytest.raises(ValidationError, match=said):
         FreeBlocks(**table(2, **columns))
     FreeBlocks(**table(2))
+
+
+def test_blocks_without_any_column():
+    with pytest.raises(ValidationError, match="there is no block; give a file"):
+        FreeBlocks()
 
 
 @pytest.mark.parametrize(("shape", "columns", "said"), [

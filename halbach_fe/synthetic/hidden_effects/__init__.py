@@ -126,7 +126,8 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
         unit = f" {parameter.unit}" if parameter.unit else ""
         low, high = parameter.limits
         if not low <= value <= high:
-            key = "coefficient_per_K" if parameter.unit == "1/K" else f"_{parameter.unit}"
+            key = ("coefficient_per_K" if parameter.unit == "1/K"
+                   else f"_{parameter.unit.replace('/', '_per_')}")
             refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value,
                    wrong_unit(key, value, {"ge": low, "le": high}))
         if parameter.name in COUNTS and value != int(value):

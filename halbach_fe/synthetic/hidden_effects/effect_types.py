@@ -108,9 +108,12 @@ def site_of(study: Study, magnet: TrueMagnet) -> Site:
         array.is_uniform, all(body.shape.has_four_edges for body in magnet.bodies))
 
 
-LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.0, "1/T^2": 10.0,
+LARGEST = {"m": 0.1, "rad": np.pi, "T": 1.0, "K": 500.0, "1/K": 0.1, "1/T": 10.0, "1/T^2": 10.0,
            "A/m": 1e8, "m^3": 1.0}
 """Largest absolute value of a parameter by its unit: what is beyond was meant in another unit."""
+
+METRES = (-1.0, 1.0)
+"""Limits in m of a place, and of the whole map's displacement."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects.effect_types import (
+    METRES,
     Check,
     Draw,
     HiddenEffect,
@@ -103,7 +104,8 @@ FAULTS = (
            "axes"),
     _fault("quadratic_nonlinearity", "value 1/T", draw_number(1e-3, 1e-2), _plus("quadratic")),
     _fault("cubic_nonlinearity", "value 1/T^2", draw_number(2e-3, 2e-2), _plus("cubic")),
-    _fault("mapper_translation", "x m, y m, z m", _draw_vector(2e-4, 2e-3), _plus("translation")),
+    _fault("mapper_translation", "x m, y m, z m", _draw_vector(2e-4, 2e-3), _plus("translation"),
+           x=METRES, y=METRES, z=METRES),
     _fault("mapper_roll", "angle rad", draw_number(5e-4, 5e-3), _turned(2)),
     _fault("mapper_tilt_x", "angle rad", draw_number(5e-4, 5e-3), _turned(0), "3d"),
     _fault("mapper_tilt_y", "angle rad", draw_number(5e-4, 5e-3), _turned(1), "3d"),
@@ -185,9 +187,9 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
 
 
 def _gross(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
-           check: Check | None = None) -> HiddenEffect:
+           check: Check | None = None, **limits: Any) -> HiddenEffect:
     """Return a gross error of the instrument."""
-    return replace(_fault(name, stated, draw, apply, *needs), group="gross", check=check)
+    return replace(_fault(name, stated, draw, apply, *needs, **limits), group="gross", check=check)
 
 
 def _of_two_axes(_: Site, values: Values) -> Refused:
@@ -205,7 +207,8 @@ GROSS_ERRORS = (
     # on another radius; a line on the axis becomes one beside it
     _gross("wrong_radius", "change m", lambda site, generator: (
         signed_log_uniform(generator, 0.05, 0.2) * (
-            site.radius if site.radius > 0 else site.inner),), _plus("radius_error")),
+             site.radius if site.radius > 0 else site.inner),), _plus("radius_error"),
+         change=METRES),
     _gross("swapped_axes", "first, second", _draw_swap, _swapped, "axes", check=_of_two_axes),
     _gross("sign_flipped_axis", "axis", lambda site, generator: (
         float(1 + "xyz".index(generator.choice(site.components))),), _sign_flipped, "axes"),

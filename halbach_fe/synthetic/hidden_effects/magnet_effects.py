@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import unit_circle
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.hidden_effects.effect_types import (
+    METRES,
     Check,
     Draw,
     HiddenEffect,
@@ -507,7 +508,7 @@ def _effect(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
                         of_blocks=of_blocks, check=check)
 
 
-RADIUS, LOST, PERMEABILITY = (1e-4, 100.0), (0.0, 1.0), (-0.5, 10.0)
+RADIUS, LOST, PERMEABILITY = (1e-4, 10.0), (0.0, 1.0), (-0.5, 10.0)
 
 EFFECTS = (
     _effect("iron_ring", "inner_radius m, outer_radius m, relative_permeability, "
@@ -577,9 +578,10 @@ EFFECTS = (
         float(value) for value in log_uniform(generator, 5e-5, 5e-4)
         * np.array(draw_direction(generator, site.dimension))), background),
     _effect("neighbour_magnet", "distance m", _draw_neighbour, neighbour_magnet, "3d",
-            check=_beside, distance=(-100.0, 100.0)),
+            check=_beside, distance=(-10.0, 10.0)),
     _effect("ferromagnetic_object", "x m, y m, z m, volume m^3", _draw_object,
-            ferromagnetic_object, "3d", check=_outside_of_blocks, volume=(1e-12,)),
+            ferromagnetic_object, "3d", check=_outside_of_blocks, x=METRES, y=METRES, z=METRES,
+            volume=(1e-12,)),
     _effect("knee", "coercivity A/m, squareness", lambda site, generator: (
         generator.uniform(5.0e5, 5.8e5), generator.uniform(0.8, 0.9)), knee, "3d", "vacuum",
-        "few blocks", "four edges", coercivity=(1.0,), squareness=(0.01, 1.0)))
+        "few blocks", "four edges", coercivity=(1e4, 1e7), squareness=(0.01, 1.0)))
