@@ -231,6 +231,6 @@ def test_blocks_of_a_neighbour_deviate(session, monkeypatch):
         return off @ np.linalg.solve(result.posterior.covariance, off) / len(off)
 
     assert chi2() < 1.5  # of 36 to 108 magnetizations, whose sd is below 0.25
-    monkeypatch.setattr(module_of_infer, "neighbour_deviations",
-                        lambda magnet, points: np.zeros((1, *points.shape)))
+    monkeypatch.setattr(module_of_infer, "neighbour_columns", lambda magnet, points: np.zeros(
+        (*points.shape, len(magnet.nominal_magnetization))))
     assert chi2() > 3

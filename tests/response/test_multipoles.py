@@ -536,7 +536,7 @@ def test_few_angles_do_not_mistake_high_orders_for_low_ones(
     errors = {}
     for name in ("without", "with"):
         if name == "with":
-            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: (0.0, 0.0))
+            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: 3 * (0.0,))
         models = circles_of(study, session)
         main = None
         for model in sorted(models, key=lambda one: abs(one.z)):
