@@ -46,8 +46,8 @@ class Sizes:
         """Return those of a study; a larger ``coarseness`` is for error bars."""
         usual = 0.4  # growth - 1 for which the numbers below are
         relative = coarseness * (mesh.growth - 1) / usual
-        return cls(coarseness * mesh.block_size_m, 1.2 * relative, min(0.25 * relative, 1.0), 0.4,
-                   0.3 * relative, 0.35 * relative**0.6)
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, min(0.35 * relative, 1.0), 0.35,
+                   0.3 * relative, 0.8 * relative**0.5)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
@@ -61,15 +61,16 @@ class Sizes:
 
         They are integrals of 1 / size^3 over the bodies, their edges and the air near them.
         """
-        growth, unknowns = self.growth, 700 + 150 * self.growth**-3  # some, and those far away
+        growth = min(self.growth, 0.6)  # Gmsh's elements grow no faster
+        unknowns = 800 * growth**-3  # far away
         for body in bodies:
             volume, surface, edges = body.measures
             size = self.of_body(body)
             small, reach = self.edge * size, (1 - self.edge) * size / growth
             inside = volume / size**3 + edges * np.pi / 4 * reach**2 / (small * size**2)
-            unknowns += 5.0 * inside + 2.0 * surface / (growth * size**2) + (
-                5.5 * 0.75 * np.pi * edges / (growth**2 * small))
-        return round(0.77 * unknowns), round(unknowns)
+            unknowns += 4.0 * inside + 55.0 * surface / (growth * size**2) + (
+                9.4 * 0.75 * np.pi * edges / (growth**2 * small))
+        return round(0.22 * unknowns), round(unknowns)
 
 
 @dataclass(frozen=True)

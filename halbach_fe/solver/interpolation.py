@@ -265,6 +265,22 @@ def _bubbles(reference: Floats) -> tuple[Floats, Floats]:
     return np.stack(values, axis=1) / 16, np.stack(slopes, axis=1) / 16
 
 
+def cubic_slopes(reference: Floats) -> Floats:
+    """Return derivatives (n, 10, 3) of what makes nodal functions of tetrahedra third order.
+
+    They are GetDP's BF_Node_3E on the six edges and BF_Node_3F on the four faces.
+    """
+    w, slopes = _barycentric(reference)
+    s = np.broadcast_to(slopes, (len(w), *slopes.shape))
+    a, b = np.array(_TETRAHEDRON_EDGES).T
+    of_edges = ((2 * w[:, a] - w[:, b]) * w[:, b])[..., None] * s[:, a] + (
+        (w[:, a] - 2 * w[:, b]) * w[:, a])[..., None] * s[:, b]
+    a, b, c = np.array(_TETRAHEDRON_FACES).T
+    of_faces = sum((w[:, p] * w[:, q])[..., None] * s[:, r]
+                   for p, q, r in ((a, b, c), (b, c, a), (c, a, b)))
+    return np.concatenate([of_edges, of_faces], axis=1)
+
+
 def _barycentric(reference: Floats) -> tuple[Floats, Floats]:
     """Return barycentric coordinates (n, d + 1) and their constant derivatives (d + 1, d)."""
     dimension = reference.shape[1]

@@ -8,9 +8,11 @@ cancels in iron of high permeability (J. Simkin, C. W. Trowbridge, Int. J. Numer
 
     S (psi - psi_s) + int (mu_r(|grad psi|) - 1) grad psi . grad v = 0    for all v.
 
-GetDP assembles the stiffness S of vacuum, see pro/iron_bodies.pro. The steps of Newton's method are
-solved by conjugate gradients, with two levels as the preconditioner: the corners of the elements,
-which are factorized, and all nodes, which a Gauss-Seidel sweep smooths.
+GetDP assembles the stiffness S of vacuum, see pro/iron_bodies.pro. Its functions are of third
+order: where the field is smooth they are five times as exact as those of second order in the same
+time, and twice where edges make it singular. The steps of Newton's method are solved by conjugate
+gradients, with two levels as the preconditioner: the corners of the elements, which are factorized,
+and all unknowns, which a Gauss-Seidel sweep smooths.
 
 The field outside is that of the polarization J = (mu_r - 1) mu_0 H of the iron, integrated over its
 elements. Its error falls faster than that of the gradient of the potential in the air, because it
@@ -44,10 +46,11 @@ from halbach_fe.solver.axisymmetric_iron import (
     excess_in,
     newton,
 )
-from halbach_fe.solver.dofs import check_difference, factorize
+from halbach_fe.solver.dofs import Unknowns, check_difference, factorize
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
 from halbach_fe.solver.interpolation import (
     QUADRATURE,
+    cubic_slopes,
     elements_of,
     quadrature,
     shape_functions,
@@ -171,9 +174,11 @@ class Problem:
     stiffness_of_vacuum: sparse.csr_array
     """Shape (n, n)."""
     nodes: Ints
-    """Unknowns of the iron's elements. Shape (e, 10)."""
+    """Unknowns of the iron's elements: of nodes, edges and faces. Shape (e, 20)."""
+    turned: Floats
+    """-1 where the function of an unknown counts its edge backwards, otherwise 1. Shape (e, 20)."""
     slopes: Floats
-    """Gradients of the functions of the nodes at the Gauss points. Shape (e, 15, 10, 3), in 1/m."""
+    """Gradients of the functions at the Gauss points. Shape (e, 15, 20, 3), in 1/m."""
     weights: Floats
     """Shape (e, 15), in m^3."""
     places: Floats
@@ -229,7 +234,7 @@ class Problem:
         if len(missing):
             raise PointsOutsideError("iron", "in the elements of its iron; instead "
                                      f"{len(missing)} points lie in none of them")
-        slopes = slopes_in(self.places[cells], reference)
+        slopes = _slopes(self.places[cells], reference, self.turned[cells])
         found = np.zeros((len(points), potential.shape[1], 3))
         np.add.at(found, rows, -np.einsum("nkd,nkc->ncd", slopes, potential[self.nodes[cells]]))
         share = np.bincount(rows, minlength=len(points))[:, None, None]
@@ -273,7 +278,7 @@ class Problem:
     def matrix(self, differential: Floats) -> sparse.csr_array:
         """Return the integrals (n, n) of (tensor (e, 15, 3, 3) grad u) . grad v."""
         size = self.stiffness_of_vacuum.shape[0]
-        parts = np.empty((len(self.nodes), 10, 10))
+        parts = np.empty((len(self.nodes), *2 * self.nodes.shape[1:]))
         step = 4096  # elements at a time, which limits the memory
         for some in slices(len(parts), step):
             weighted = differential[some] * self.weights[some, :, None, None]
@@ -292,7 +297,7 @@ class Problem:
         right = -self.integrate(values.reshape(*self.weights.shape, 3, -1))
         inside, tangent = self._iron
         found = np.zeros_like(right)
-        found[inside] = tangent.solve(right[inside], 1e-10)
+        found[inside] = tangent.solve(right[inside], 1e-8)
         return found
 
     @cached_property
@@ -301,7 +306,9 @@ class Problem:
         inside = np.unique(self.nodes)
         own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
         own = own[inside][:, inside]
-        fixed = np.unique(connected_components(own, directed=False)[1], return_index=True)[1]
+        corners = np.flatnonzero(np.isin(inside, self.nodes[:, 0]))
+        fixed = corners[np.unique(connected_components(own, directed=False)[1][corners],
+                                  return_index=True)[1]]
         extra = np.zeros(len(inside))
         extra[fixed] = own.diagonal()[fixed]  # the solution is 0 there, as the rows add up to 0
         up = self.coarse[inside]
@@ -322,18 +329,23 @@ class Tangent:
     def of(cls, problem: Problem, matrix: sparse.csr_array, up: sparse.csr_array) -> Tangent:
         """Return the tangent of a matrix (n, n), with ``up`` (n, corners) as `Problem.coarse`."""
         matrix = sparse.csr_array(matrix)
+        matrix.sort_indices()  # for `sweep`
         return cls(problem, matrix, up, factorize(up.T @ (matrix @ up)))
+
+    @cached_property
+    def _diagonal(self) -> Floats:
+        return np.asarray(self.matrix.diagonal())
 
     def precondition(self, residual: Floats) -> Floats:
         """Return approximate solutions (n, c) by a sweep, the coarse level and a sweep back."""
-        a, up = self.matrix, self.up
+        a, up, diagonal = self.matrix, self.up, self._diagonal
         found = np.zeros_like(residual)
-        sweep(a.indptr, a.indices, a.data, residual, found, False)
+        sweep(a.indptr, a.indices, a.data, diagonal, residual, found, False)
         rest = np.ascontiguousarray(up.T @ (residual - a @ found))
         for column in range(rest.shape[1]):
             rest[:, column] = self.coarse.solve(rest[:, column].copy())
         found += up @ rest
-        sweep(a.indptr, a.indices, a.data, residual, found, True)
+        sweep(a.indptr, a.indices, a.data, diagonal, residual, found, True)
         return found
 
     def solve(self, right: Floats, tolerance: float) -> Floats:
@@ -370,7 +382,7 @@ class BodiesReaction(WithBar):
         """Return B (n, 3) in T of the polarization of some bodies, counted from 0, alone."""
         mine = np.isin(self.problem.body, numbers)
         part = replace(self.problem, **{key: getattr(self.problem, key)[mine] for key in (
-            "nodes", "slopes", "weights", "places", "body")})
+            "nodes", "turned", "slopes", "weights", "places", "body")})
         return _field_of(part, self.polarization[mine], points)
 
     def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
@@ -460,13 +472,12 @@ def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
 COARSER = 2.0
 """Ratio of the sizes of elements of two meshes, by whose difference the field is extrapolated."""
 
-NEAR_AND_FAR, TO_COME, BAR = (2.0, 4.0), (0.0, 0.35), (1.0, 0.3)
+NEAR_AND_FAR, TO_COME, BAR = (2.0, 4.0), (0.0, 0.35), (0.6, 0.3)
 """What finer elements will change, and the error bar of that, both relative to the change from the
 coarser mesh, by the distance from the middle of the nearest element in radii of that element;
 between them they are interpolated. Near iron the error changes from point to point with the
-elements. Farther away, by elements of 0.6 or 0.7 of the size, 0.4 to 0.5 of the change was to come
-for a tube, plates, wedges and poles, whose error falls by the power 1.6 of the size as the field at
-edges is singular; 0.3 for poles of an undulator that saturate; 0.2 for a sphere in closed form."""
+elements. Farther away 0.2 to 0.5 of the change was to come for a box, whose error falls by the
+power 4/3 of the size as the field at edges is singular, and 0.3 for plates."""
 
 
 def solve_bodies(
@@ -553,7 +564,7 @@ def _assemble(magnet: Magnet, session: Session, coarseness: float) -> Problem:
         return regions
 
     mesh = verify_mesh(write_files(session.folder, "iron", draw))
-    count = mesh.inner.nodes
+    count = mesh.inner.nodes + mesh.inner.edges + mesh.inner.faces
     _check_memory(magnet, coarseness, count)  # gaps between bodies are not in the estimate
     (shell,), numbers = shells, ("CX", "CY", "CZ")
     job = Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
@@ -563,9 +574,9 @@ def _assemble(magnet: Magnet, session: Session, coarseness: float) -> Problem:
               options=ROUGHLY, linear_residual=ROUGH_RESIDUAL)
     ((unknowns, matrix, solution),) = assembled(
         session, mesh, "scalar_potential", [("getdp-iron", alone(mesh, job))], count)
-    problem = _problem(magnet.iron, mesh, unknowns.functions[0], matrix)
+    problem = _problem(magnet.iron, mesh, unknowns, matrix)
     in_air = mesh.tags < tags.FIRST_BLOCK_TAG
-    check_matrix(problem, unknowns.functions[0][mesh.cells[in_air] + 1], solution.T)
+    check_matrix(problem, _numbers(mesh, unknowns)[in_air], solution.T)
     return problem
 
 
@@ -609,7 +620,7 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     """
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 
-    gib_each, mesh = 16_000 / 2**30, magnet.study.mesh  # memory per unknown
+    gib_each, mesh = 26_000 / 2**30, magnet.study.mesh  # memory per unknown
     estimate, available = size_of(magnet, coarseness).unknowns, available_memory()
     unknowns = known or round(4 / 3 * estimate)
     if available is None or gib_each * unknowns <= available:
@@ -631,21 +642,40 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
         f"{gib_each * unknowns:.2g} GiB", hint))
 
 
-def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,
+def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, unknowns: Unknowns,
              matrix: sparse.csr_array) -> Problem:
-    """Return the discrete problem; ``index`` has the unknown of a node, counted from 1."""
+    """Return the discrete problem."""
     iron = np.flatnonzero(mesh.tags >= tags.FIRST_BLOCK_TAG)
     located, weights = quadrature(mesh, iron)
-    slopes = slopes_in(mesh.points[mesh.cells[located.cells]], located.reference)
+    turned = np.ones((len(iron), 20))
+    turned[:, 10:16] = np.sign(unknowns.edges[iron])
+    slopes = _slopes(mesh.points[mesh.cells[located.cells]], located.reference,
+                     np.repeat(turned, POINTS, axis=0))
     return Problem(
-        bodies, matrix, index[mesh.cells[iron] + 1], slopes.reshape(-1, POINTS, 10, 3),
-        weights.reshape(-1, POINTS), mesh.points[mesh.cells[iron]],
-        mesh.tags[iron] - tags.FIRST_BLOCK_TAG, _prolongation(mesh, index))
+        bodies, matrix, _numbers(mesh, unknowns)[iron], turned,
+        slopes.reshape(-1, POINTS, 20, 3), weights.reshape(-1, POINTS),
+        mesh.points[mesh.cells[iron]],
+        mesh.tags[iron] - tags.FIRST_BLOCK_TAG, _prolongation(mesh, unknowns))
 
 
-def _prolongation(mesh: VerifiedMesh, index: Ints) -> sparse.csr_array:
+def _numbers(mesh: VerifiedMesh, unknowns: Unknowns) -> Ints:
+    """Return the unknowns (e, 20) of the functions of all elements, -1 for those that vanish."""
+    entities = mesh.cells + 1, np.abs(unknowns.edges), np.abs(unknowns.faces)
+    return np.hstack([function[each] for function, each in zip(
+        unknowns.functions, entities, strict=True)])
+
+
+def _slopes(nodes: Floats, reference: Floats, turned: Floats) -> Floats:
+    """Return gradients (n, 20, 3) in 1/m of the functions in elements with nodes (n, 10, 3)."""
+    slopes = np.concatenate([shape_functions("tetra10", reference)[1], cubic_slopes(reference)],
+                            axis=1)
+    return slopes_in(nodes, reference, slopes) * turned[..., None]
+
+
+def _prolongation(mesh: VerifiedMesh, unknowns: Unknowns) -> sparse.csr_array:
     """Return the operator (n, corners) from values at the corners to those at all unknowns."""
     ends = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])  # as meshio orders edges
+    index = unknowns.functions[0]
     cells = index[mesh.cells + 1]
     corners = np.unique(cells[:, :4])
     corners = corners[corners >= 0]
@@ -658,4 +688,4 @@ def _prolongation(mesh: VerifiedMesh, index: Ints) -> sparse.csr_array:
     rows = np.concatenate([corners, pairs[:, 0]])
     columns = np.concatenate([np.arange(len(corners)), pairs[:, 1]])
     values = np.concatenate([np.ones(len(corners)), np.full(len(pairs), 0.5)])
-    return sparse.csr_array((values, (rows, columns)), shape=(int(index.max()) + 1, len(corners)))
+    return sparse.csr_array((values, (rows, columns)), shape=(unknowns.count, len(corners)))

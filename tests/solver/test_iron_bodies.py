@@ -89,8 +89,9 @@ def coarse_mesh(monkeypatch):
 
 
 def test_sphere_in_a_uniform_field(sphere):
-    """mu_r = 1000, closed form: at elements of 5 mm the error was measured to be 3e-3 of the field
-    5 mm off the surface and less than its bar; the coarser mesh is farther off.
+    """mu_r = 1000, closed form: by elements of 7 mm the error was measured to be 1.1e-3 of the
+    field, 5 mm off the surface, and less than its bar; the coarser mesh is farther off. It was
+    2.9e-3 by functions of second order on elements of 5 mm.
     """
     background, found = sphere
     points = np.array([0.0, 0.0, 0.05]) + 0.025 * np.array(
@@ -98,7 +99,7 @@ def test_sphere_in_a_uniform_field(sphere):
     exact = sphere_in_uniform_field(background, 1000.0, 0.02, points - [0.0, 0.0, 0.05])
     error = np.linalg.norm(found.field(points) - exact, axis=1)
     bars = found.error(points)[:, 0]
-    assert error.max() < 6e-3 * np.linalg.norm(background)  # twice what was measured
+    assert error.max() < 2.2e-3 * np.linalg.norm(background)  # twice what was measured
     assert (error < bars).all()
     assert np.sqrt(np.mean(bars**2)) < 15 * np.sqrt(np.mean(error**2))
     coarser = np.linalg.norm(found.coarse.field(points) - exact, axis=1)
@@ -280,6 +281,11 @@ def test_two_unknowns_that_change_places_are_told(session, monkeypatch):
     check(problem, surface, solution)
     inside = np.setdiff1d(problem.nodes, surface)
     assert len(inside) > 100
+    element, edge = np.argwhere(np.isin(problem.nodes[:, 10:16], inside))[0]
+    turned = problem.slopes.copy()
+    turned[element, :, 10 + edge] *= -1  # an edge counted backwards
+    with pytest.raises(GetDPError, match="matrix differs by"):
+        check(replace(problem, slopes=turned), surface, solution)
     order = np.arange(len(solution))
     order[inside[[0, -1]]] = inside[[-1, 0]]
     wrong = replace(problem, nodes=order[problem.nodes])
@@ -310,7 +316,7 @@ def test_edges_at_narrow_gaps_have_small_elements():
     touching, glued, narrow, wide = (
         nodes_of(lower, upper | {"centre_m": [0.05, 0.0, 0.01 + gap]})
         for gap in (0.0, 1e-5, 1e-3, 0.02))
-    assert narrow > 1.3 * wide
+    assert narrow > 1.2 * wide  # 1.29 was measured
     assert touching < 1.1 * wide
     assert narrow < glued < 10 * wide
 
@@ -375,7 +381,7 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
                        [0.0, 0.0, 0.03], [0.018, 0.0, 0.06]])
     coarse, fine = (solve_bodies(
         build_magnet(study_with(body, mesh={"block_size_m": 0.02, "growth": growth})), uniform,
-        session.within(name)) for name, growth in (("coarse", 1.9), ("fine", 1.5)))
+        session.within(name)) for name, growth in (("coarse", 1.7), ("fine", 1.4)))
     found, change = coarse.field_with_errors(points)
     bars = np.linalg.norm(change, axis=1)
     plain = iron_bodies._field_of(coarse.problem, coarse.polarization, points)
@@ -458,10 +464,10 @@ def test_the_solution_serves_the_stray_field(session, coarse_mesh, monkeypatch):
 
 
 def test_the_key_of_finer_iron_is_named():
-    """Elements of a sphere are a quarter of its radius, or of the study's size if that is less."""
+    """Elements of a sphere are a third of its radius, or of the study's size if that is less."""
     magnet = build_magnet(study_with(SPHERE))
     assert finer_in_words(magnet, POINTS) == (
-        "a smaller mesh.block_size_m (elements of iron now have 5 mm)")
+        "a smaller mesh.block_size_m (elements of iron now have 7 mm)")
     finer = build_magnet(study_with(SPHERE, mesh={"block_size_m": 0.003}))
     assert "now have 3 mm" in finer_in_words(finer, POINTS)
 
@@ -558,11 +564,11 @@ def test_size_is_foretold(sphere):
         assert unknowns / len(solved.total) == pytest.approx(1.0, abs=0.5)
 
 
-def test_a_turned_tube_is_as_by_azimuthal_modes(session, coarse_mesh):
+def test_a_turned_tube_is_as_by_azimuthal_modes(session):
     """A steel cylinder beside a permeable block, upside down: the other solver, non-linear."""
     tube = {"kind": "tube", "inner_radius_m": 0.0, "outer_radius_m": 0.02, "length_m": 0.03,
             "centre_m": [0.0, 0.0, 0.05]}
-    make = partial(study_with, permeability=1.05,
+    make = partial(study_with, permeability=1.05, mesh={"block_size_m": 0.02, "growth": 1.6},
                    iron={"curve": {"kind": "steel", "name": "aisi_1010"}})
     modes, bodies = (build_magnet(make(body)) for body in (
         tube, tube | {"rotation_deg": [180.0, 0.0, 0.0]}))
@@ -619,7 +625,7 @@ def test_too_little_memory_is_told_before_meshing(session, monkeypatch):
     assert 0.0005 < size < 0.002
     with pytest.raises(ZeroDivisionError):
         solve_bodies(magnet.with_(mesh__block_size_m=size), np.zeros_like, session)
-    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 60.0)
+    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 100.0)
     with pytest.raises(ZeroDivisionError):
         solve_bodies(magnet, np.zeros_like, session)
 

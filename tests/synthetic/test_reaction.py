@@ -187,6 +187,7 @@ def test_elements_are_small_at_the_ends_of_tubes():
 
     assert farthest(Elements()) < 1.3 * thickness
     assert farthest(Elements(0.03)) > 1.7 * thickness
+    assert farthest(Elements(0.03, edge=0.004)) < 1.3 * 0.004
 
 
 def test_block_table_of_a_magnet_of_all_kinds():
