@@ -504,6 +504,7 @@ class _Diagnosing:
             apply_effects(self.corrected, identified), self.position_noise)
         update = infer(
             build_magnet(study), self.task.data, self._subsession(name), known,
+            linearized_only=True,  # `infer` of the study as found tells whether that is enough
             validation_map=self.task.validation_map, similar=self.solved)
         self.solved = self.solved if update.response.of_similar else update.magnet
         return update

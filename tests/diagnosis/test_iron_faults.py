@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.study.iron import IronRing
 from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import simulate_campaign
+from tests.conftest import DIPOLE, changed
 
 NOISE_T = 5e-4
 
@@ -46,3 +52,36 @@ def test_a_plate_in_another_place_is_named(higher_m, session):
     assert named.hypothesis.effect.name == "iron_displaced"
     assert named.values[2] == pytest.approx(higher_m, abs=3 * named.sd[2])
     assert named.sd[2] < higher_m / 3
+
+
+def test_blocks_beside_a_tube_that_saturates(session):
+    """Found as linear iron the tube was 20 mm thick and 4.5 mm farther out, beside a plain "Yes"."""
+    pytest.importorskip("ngsolve")
+    study = parse_study(changed(
+        DIPOLE, array__blocks_per_ring=8, array__recoil_permeability=1.0, mesh__block_size_m=0.014,
+        noise={"regions": [{"name": "all", "sigma_T": 2e-5}]}, observation__positions={
+            "kind": "circles", "radius_m": [0.05, 0.085], "angles": 48}))
+    inner, outer = study.array.outer_radius_m + np.array([0.004, 0.008])
+    seen = simulate_campaign(study, 1, hide=[(EFFECTS["iron_ring"], (inner, outer, 1400.0, 2.05))])
+    some = [one for one in catalogue() if one.name in (
+        "iron_ring", "gain_x", "temperature_gradient")]
+    found = diagnose(study, seen.readings, session, effects=some)
+    (named,) = found.identified
+    assert named.hypothesis.effect.name == "iron_ring"
+    off = np.subtract(named.place.at_m, (inner, outer))
+    _, farther, thicker, *_ = named.sd
+    assert abs(off[0]) < 3 * farther
+    assert abs(off[1]) < 3 * np.hypot(farther, thicker)
+
+    def chi2_of_blocks(study):
+        result = infer(build_magnet(study), seen.readings, session, linearized_only=True)
+        count = len(result.magnet.parameter_names)
+        true = {(body.ring, body.slot): body.magnetization[:2] for body in seen.magnet.bodies}
+        away = result.posterior.mean[:count] - np.concatenate(
+            [true[block.ring, block.slot] for block in result.magnet.blocks])
+        return away @ np.linalg.solve(result.posterior.covariance[:count, :count], away) / count
+
+    assert chi2_of_blocks(found.study) < 2
+    linear = IronRing(inner_radius_m=inner, outer_radius_m=outer, relative_permeability=1400.0)
+    # negative control: without the saturation, in the right place
+    assert chi2_of_blocks(study.with_(iron_ring=linear)) > 4
