@@ -296,7 +296,7 @@ def test_what_an_update_knows_of_neighbours_is_everywhere(beside_a_neighbour, tm
 
 def test_one_map_after_the_other_beside_a_neighbour(beside_a_neighbour):
     """Updates by one half of a map and then by the other find what one by the whole map does."""
-    field, result = beside_a_neighbour[0]
+    _, result = beside_a_neighbour[0]
     magnet = result.magnet.with_(observation={"quantity": "flux_density", "positions": {
         "kind": "points", "points_m": [[0.0, 0.0, 0.0]]}})
     points = result.observation.map_points
