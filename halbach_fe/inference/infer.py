@@ -65,7 +65,7 @@ from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, with_independent
+from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, stacked_root, with_independent
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
@@ -348,6 +348,7 @@ class _Search:
         matrix: Rows = model.matrix
         prior = self._prior_of_blocks(len(model.parameters)).stacked
         if len(prior.mean) > len(model.parameters):
+            prior = replace(prior, root=stacked_root(prior.root))  # of an earlier update, too
             matrix = Beside(matrix, neighbour_readings(self.magnet, self.maps, readings))
         exact, of_field = matrix, matrix
         for of, columns, mean, sd in self._beside(readings):

@@ -253,7 +253,7 @@ def stacked_root(*roots: Floats | sparse.csr_array | CovarianceFactor) -> Covari
 
     With [L_1 L_2 ...] as the root the covariance is L_1 L_1' + L_2 L_2' + ...
     """
-    return _sparse_root(sparse.hstack([root_matrix(root) for root in roots]))
+    return _sparse_root(sparse.hstack([sparse.csr_array(root_matrix(root)) for root in roots]))
 
 
 def with_independent(prior: Gaussian, mean: Floats, sd: Floats) -> Gaussian:

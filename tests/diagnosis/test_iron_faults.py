@@ -58,7 +58,7 @@ def test_blocks_beside_a_tube_that_saturates(session):
     """Found as linear iron the tube was 20 mm thick and 4.5 mm farther out, beside a plain "Yes"."""
     pytest.importorskip("ngsolve")
     study = parse_study(changed(
-        DIPOLE, array__blocks_per_ring=8, array__recoil_permeability=1.0, mesh__block_size_m=0.014,
+        DIPOLE, array__blocks_per_ring=8, array__recoil_permeability=1.0, mesh__block_size_m=0.04,
         noise={"regions": [{"name": "all", "sigma_T": 2e-5}]}, observation__positions={
             "kind": "circles", "radius_m": [0.05, 0.085], "angles": 48}))
     inner, outer = study.array.outer_radius_m + np.array([0.004, 0.008])

@@ -294,6 +294,23 @@ def test_what_an_update_knows_of_neighbours_is_everywhere(beside_a_neighbour, tm
     assert known(earlier).main_sd > 10 * exact.main_sd
 
 
+def test_one_map_after_the_other_beside_a_neighbour(beside_a_neighbour):
+    """Updates by one half of a map and then by the other find what one by the whole map does."""
+    _, result = beside_a_neighbour[0]
+    magnet = result.magnet.with_(observation={"quantity": "flux_density", "positions": {
+        "kind": "points", "points_m": [[0.0, 0.0, 0.0]]}})
+    points = result.observation.map_points
+    data = field_map(points, result.readings.reshape(-1, 3))
+    first = infer(magnet, data.isel(point=slice(0, None, 2)), Session.temporary())
+    both = infer(magnet, data.isel(point=slice(1, None, 2)), Session.temporary(),
+                 prior=first.posterior)
+    np.testing.assert_allclose(both.prior.stacked.sd, first.posterior.stacked.sd, rtol=1e-6)
+    for one, whole in ((both.posterior, result.posterior),
+                       (both.posterior.beside, result.posterior.beside)):
+        np.testing.assert_allclose(one.sd, whole.sd, rtol=1e-4)
+        np.testing.assert_allclose(one.mean, whole.mean, atol=0.01 * whole.sd.min())
+
+
 def test_circles_that_the_mapper_has_moved_are_none_of_the_magnet(generator, tmp_path):
     """Their middle is not that of the magnet; the field is said at its place in the magnet."""
     angle = 2 * np.pi * np.arange(16) / 16
