@@ -265,7 +265,7 @@ def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Fl
     sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
     places: list[Floats] = [points_from(positions) for positions in sets]
     candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
-    wanted = count or magnet.study.plan.points or len(baseline)
+    wanted = count or magnet.study.plan.points or min(len(baseline), len(candidates))
     if wanted > len(candidates):
         raise StudyError(
             f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "

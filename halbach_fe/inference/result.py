@@ -239,8 +239,8 @@ class Stretch:
     @property
     def where(self) -> str:
         """The place in words."""
-        low, high = (f"{1e3 * each:.0f}".replace("-", "−") for each in (self.from_m, self.to_m))
-        return f"{self.axis} = {low} to {high} mm"
+        low, high = (str(round(1e3 * each)).replace("-", "−") for each in (self.from_m, self.to_m))
+        return f"{self.axis} = {low}{f' to {high}' if high != low else ''} mm"
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def _count(design: RingDesign) -> str:
     """Return the number of rings in words."""
     rings = sum((1 if z == 0 else 2) * sum(ring is not None for ring in option)
                 for z, option in zip(design.z_m, design.rings, strict=True))
-    return f"{rings} rings"
+    return counted(rings, "ring")
 
 
 def _design_rows(found: Designed) -> Rows:

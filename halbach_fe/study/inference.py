@@ -156,8 +156,9 @@ class Inference(StudyModel):
 class Plan(StudyModel):
     """Settings of `halbach-fe plan`, which chooses the most informative measurement positions.
 
-    ``points`` is the number of positions to choose (default: as many as ``observation`` has),
-    ``candidates`` the positions to choose from (default: those of ``observation``).
+    ``points`` is the number of positions to choose (default: as many as ``observation`` has, or
+    all candidates if these are fewer), ``candidates`` the positions to choose from (default: those
+    of ``observation``).
     """
 
     points: Annotated[int, Field(ge=1, le=100_000)] | None = None

@@ -55,7 +55,7 @@ def test_a_plate_in_another_place_is_named(higher_m, session):
 
 
 def test_blocks_beside_a_tube_that_saturates(session):
-    """Found as linear iron the tube was 20 mm thick and 4.5 mm farther out, beside a plain "Yes"."""
+    """Found as linear iron the tube was 20 mm thick and 4.5 mm farther out, beside a "Yes"."""
     pytest.importorskip("ngsolve")
     study = parse_study(changed(
         DIPOLE, array__blocks_per_ring=8, array__recoil_permeability=1.0, mesh__block_size_m=0.04,

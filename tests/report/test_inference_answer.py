@@ -11,7 +11,13 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.result import HELD_OUT, Amplitudes, InferenceResult, far_in_words
+from halbach_fe.inference.result import (
+    HELD_OUT,
+    Amplitudes,
+    InferenceResult,
+    Stretch,
+    far_in_words,
+)
 from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.words import flux_density, ppm
@@ -76,6 +82,13 @@ def test_noise_that_is_stated_too_large_is_no_disagreement(campaign, session):
     assert said.said.startswith("Model and measurement agree better than the stated noise allows")
     assert "halbach-fe check" in said.command
     assert not said.sound
+
+
+@pytest.mark.parametrize(("from_m", "to_m", "said"), [
+    (-0.0141, -0.0141, "x = −14 mm"), (-1e-5, 1e-5, "x = 0 mm"), (-0.02, 0.01, "x = −20 to 10 mm")])
+def test_where_a_stretch_is(from_m, to_m, said):
+    """On one plane of circles "x = −14 to −14 mm" was said, and "−0 to −0"."""
+    assert Stretch("x", from_m, to_m, 3, 1e-5, 1e-6).where == said
 
 
 def test_few_readings_are_near_the_model_by_chance(campaign, session):

@@ -175,3 +175,11 @@ def test_even_spread():
 def test_too_few_candidates(dipole, session):
     with pytest.raises(StudyError, match="at most the number of candidates, 24"):
         plan_measurement(build_magnet(dipole(noise=NOISE)), session, count=25)
+
+
+def test_fewer_candidates_than_the_study_has_positions(dipole, session):
+    """Without a number all of them are ordered; that of the positions was said to be too many."""
+    line = {"kind": "line", "start_m": [0, 0, 0], "end_m": [0.05, 0, 0], "count": 5}
+    few = {"candidates": [line]}
+    found = plan_measurement(build_magnet(dipole(noise=NOISE, plan=few)), session)
+    assert len(found.points) == 5
