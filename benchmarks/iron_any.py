@@ -381,7 +381,7 @@ def mean_flux(iron: BodiesReaction) -> Floats:
 def team13(note: Note) -> None:
     """Compare the mean flux density in the steel, and the field in the air, with measured ones."""
     def solve(current_A: float) -> tuple[Magnet, BodiesReaction]:
-        magnet = build_magnet(parse_study(plates(1.62, current_A)))
+        magnet = build_magnet(parse_study(plates(2.2, current_A)))
         with tempfile.TemporaryDirectory() as folder:
             iron = solve_separate(magnet, Session(find_getdp(), Path(folder))).iron
         assert isinstance(iron, BodiesReaction)
