@@ -56,6 +56,7 @@ from halbach_fe.measurement.probe_in_field import (
     MIXING,
     OFFSETS,
     PAIRS,
+    SCALES,
     TURNS,
     WAVES,
     Evidence,
@@ -151,6 +152,9 @@ ALMOST_ALIKE = float(np.log(20.0))
 SIGNIFICANT = 4.0
 """Standard deviations from which a parameter is reported as found."""
 
+DETERMINED = 0.5
+"""Part of its prior standard deviation below which that of a parameter must be to be determined."""
+
 ENOUGH = 0.2
 """Smallest share of readings beyond those that determine the field. With fewer, a field obeys any
 map."""
@@ -200,12 +204,29 @@ class InstrumentTerm:
     rivals: tuple[str, ...] = ()
     """Other parameters of which each by itself explains the map as well: one of all these is off,
     and the map does not tell which."""
+    likes_sd: float = 0.0
+    """Part of ``sd`` by others that change many maps nearly alike, see `_beside_likes`. It is the
+    same in all maps of one probe and stage."""
+    beaten: tuple[str, ...] = ()
+    """Such others that would be found in its place, but explain the map less well."""
 
     @property
     def found(self) -> bool:
         """Whether it differs from 0 with certainty."""
         return (self.determined and self.plausible and self.predictive
                 and abs(self.value) > SIGNIFICANT * self.sd)
+
+    @property
+    def own_sd(self) -> float:
+        """Standard deviation if none of those others is off."""
+        return float(np.sqrt(max(0.0, self.sd**2 - self.likes_sd**2)))
+
+    @property
+    def is_chosen(self) -> bool:
+        """Whether it is what explains the map best, however well its value is told."""
+        return self.found or bool(
+            self.likes_sd and self.plausible and self.predictive
+            and abs(self.value) > SIGNIFICANT * self.own_sd)
 
 
 @dataclass(frozen=True)
@@ -469,6 +490,7 @@ def check_map(
     fitted = _first_fit(scan.turned(matrix), placed, rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
     fitted, terms = _stated(fitted, scan, rows.train, pace)
+    terms = _beside_likes(fitted, terms)
     _begin(pace, 5, "fitting all scan lines")
     whole, fitted, rows = _without_spikes(fitted, rows, broken)
     return MapCheck(
@@ -715,7 +737,7 @@ def _first_fit(scan: Scan, placed: _Placed, rows: _Rows, pace: Pace) -> _Fitted:
     """
     few, probe = rows.few, placed.probe
     # around all rows, of which those that are not fitted are read too
-    charges = Charges.around(_read_at(scan.points[rows.usable], probe.sensors_m), placed.gap_m)
+    charges = Charges.around(probe.read_at(scan.points[rows.usable]), placed.gap_m)
     model = scan.model(charges)
     start = replace(model.start(NO_FIT), instrument=probe.instrument)
     model = model.few(start, rows.chosen, placed.fit.penalty)
@@ -929,12 +951,12 @@ def _placed(scan: Scan, some: ProbeModel, pace: Pace) -> _Placed:
     found: list[_Placed] = []
 
     def tried(gap_m: float, probe: ProbeFit) -> float:
-        charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap_m)
+        charges = Charges.around(probe.read_at(scan.points), gap_m)
         found.append(_Placed(gap_m, probe, scan.model(charges).fit(probe, every)))
         pace.advance(len(found), FIRST_FIT_PARTS)
         return found[-1].log_evidence
 
-    last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
+    last, read_at = -np.inf, probe.read_at(scan.points)
     for gap in reversed(GAPS):
         near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
         if near or gap == GAPS[-1]:
@@ -967,11 +989,6 @@ def _confirmed(
     return given, (_named(matrix), *alike) if better > -ALIKE else (), as_given
 
 
-def _read_at(points: Floats, sensors: Floats) -> Floats:
-    """Return where sensors at (3, 3) in m read the field (3 n, 3) at points (n, 3) in m."""
-    return np.asarray((points[:, None] + sensors).reshape(-1, 3))
-
-
 # --- instrument ---------------------------------------------------------------------------------
 
 
@@ -996,6 +1013,15 @@ class Parameter:
     row: Floats
     own: tuple[int, ...]
     beside: tuple[int, ...] = ()
+    likes: tuple[int, ...] = ()
+    """Parameters that change many maps nearly alike, which its bar contains."""
+    apart: Floats | None = None
+    """Row (p,) to which that bar belongs, if not ``row``."""
+
+    @property
+    def apart_row(self) -> Floats:
+        """The row (p,) of that bar."""
+        return self.row if self.apart is None else self.apart
 
 
 @dataclass(frozen=True)
@@ -1027,11 +1053,14 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     all_of_it = 0.99
     found = []
 
-    def add(name: str, unit: str, factor: float, weights: dict[int, float],
-            own: tuple[int, ...] = (), beside: tuple[int, ...] = ()) -> None:
+    def row_of(factor: float, weights: dict[int, float]) -> Floats:
         row = np.zeros(len(prior_sd))
         row[list(weights)] = factor * np.array(list(weights.values()))
-        found.append(Parameter(name, unit, row * prior_sd, own or tuple(weights), beside))
+        return row * prior_sd
+
+    def add(name: str, unit: str, factor: float, weights: dict[int, float],
+            own: tuple[int, ...] = (), **more: Any) -> None:
+        found.append(Parameter(name, unit, row_of(factor, weights), own or tuple(weights), **more))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",
@@ -1043,15 +1072,17 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
             {MIXING.start + 3 + axis: 1.0})
     of_size = np.einsum("mij,ij->m", MATRICES, shares)
+    likes = (*range(MIXING.stop - 3, MIXING.stop), *range(SCALES.start, SCALES.stop))
     for own in range(3):
         weights = (MATRICES[:, own, own] - of_size) * (shares[own, own] < all_of_it)
         add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
-            dict(enumerate(weights.tolist(), MIXING.start)), (MIXING.start + 6 + own,))
+            dict(enumerate(weights.tolist(), MIXING.start)), (MIXING.start + 6 + own,),
+            likes=likes)
     for (when, by_wave), own in product(CHANGES.items(), range(3)):
         add(f"turn about {COMPONENTS[own]} {when}", "mrad", 1e3,
             {TURNS.start + 3 * wave + own: weight for wave, weight in by_wave.items()},
             (TURNS.start + 3 * min(by_wave) + own,),
-            tuple(TURNS.start + 3 * min(each) + own for each in CHANGES.values()))
+            beside=tuple(TURNS.start + 3 * min(each) + own for each in CHANGES.values()))
     for own in range(3):
         add(f"change of the offset of B{COMPONENTS[own]} from start to end", "mT", 2e3,
             {OFFSETS.start + own: 1.0})
@@ -1059,8 +1090,12 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
         add(f"change of the gain {when}", "%", 100.0,
             {GAINS.start + wave: weight for wave, weight in by_wave.items()},
             (GAINS.start + min(by_wave),),
-            tuple(GAINS.start + min(each) for each in CHANGES.values()))
+            beside=tuple(GAINS.start + min(each) for each in CHANGES.values()))
     add("lag of the readings behind the stage", "mm", 1e3, {LAG: 1.0})
+    for own, others in enumerate(PAIRS):
+        axis, *rest = (SCALES.start + one for one in (own, *others))
+        add(f"scale of the stage along {COMPONENTS[own]}", "%", 100.0, {axis: 1.0}, likes=likes,
+            apart=row_of(100.0, {axis: 1.0} | dict.fromkeys(rest, -0.5)))
     return found
 
 
@@ -1132,7 +1167,8 @@ def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
 
 
 def _with_other_regions(term: InstrumentTerm, others: list[InstrumentTerm]) -> InstrumentTerm:
-    """Return a term; if it was found, with a bar that contains how other regions differ from it.
+    """Return a term; if it was found, with a bar that contains how other regions differ from it,
+    and what does nearly the same as far as that region tells them apart which does so best.
 
     Of two regions of which one contains the other, estimates differ by the root of the difference
     of their variances. A measured dipole's probe was turned by 49.4 +- 1.2 mrad by all of a map
@@ -1143,7 +1179,8 @@ def _with_other_regions(term: InstrumentTerm, others: list[InstrumentTerm]) -> I
               for other in others if other.determined]
     if not (term.found and beyond):
         return term
-    return replace(term, sd=float(np.hypot(term.sd, np.sqrt(np.mean(beyond)))))
+    return replace(term, sd=float(np.hypot(term.sd, np.sqrt(np.mean(beyond)))), likes_sd=min(
+        term.likes_sd, *(other.likes_sd if other.found else np.inf for other in others)))
 
 
 def _asked(
@@ -1207,32 +1244,81 @@ def selected(
     about as well, are kept together: in the flat field of an MRI magnet a gain that drifts along x
     is a gradient of the field and a sensor that is off along x. None is found then, as none has a
     value without the others, unless later ones help. Not ``with_rivals``, the most probable one is
-    kept alone.
+    kept alone. ``sd`` is without ``likes_sd``.
     """
     kept = np.zeros(len(told.whole.sums), bool) if known is None else known.copy()
     rivals: dict[str, tuple[str, ...]] = {}
+    beaten: dict[str, tuple[str, ...]] = {}
     while True:
         terms = [_term(parameter, kept, told) for parameter in parameters]
-        there = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
-        new = {parameter.name: _most_probable(parameter, kept, told.whole)
-               for parameter, term, old in zip(parameters, terms, there, strict=True)
-               if term.found and not old}
+        with_own = {parameter.name: (parameter, _most_probable(parameter, kept, told.whole))
+                    for parameter, term in zip(parameters, terms, strict=True)
+                    if term.found and not kept[list(parameter.own)].all()}
+        new = {name: own for name, (parameter, own) in with_own.items()
+               if not _is_told(parameter, own, kept, told.whole)}
         finer = [] if new else _finer(parameters, kept, told)
         if finer:
             kept[finer] = True
         elif not new:
             found = {term.name for term in terms if term.found}
             return kept, tuple(
-                replace(term, predictive=term.predictive and (not term.found or old),
+                replace(term, likes_sd=_by_likes(parameter, kept, told),
+                        beaten=beaten.get(term.name, ()),
                         rivals=() if found & {term.name, *rivals.get(term.name, ())}
                         else rivals.get(term.name, ()))
-                for term, old in zip(terms, there, strict=True))
+                for term, parameter in zip(terms, parameters, strict=True))
         else:
             alike = _alike(new, told.whole)[:None if with_rivals else 1]
             rivals |= {name: tuple(other for other in alike if other != name) for name in alike}
-            for parameter in parameters:
-                if parameter.name in alike:
-                    kept[list(parameter.own)] = True
+            for one in [each for each in parameters if each.name in alike]:
+                kept[list(one.own)] = True
+                beaten[one.name] = tuple(
+                    other.name for other in parameters if other is not one
+                    and other.name in new and set(other.own) <= set(one.likes))
+
+
+def _is_told(
+    parameter: Parameter, with_own: NDArray[np.bool_], kept: NDArray[np.bool_], whole: Evidence
+) -> bool:
+    """Tell whether what is kept (p,) has a parameter already, as the gain of one component has that
+    of another one relative to |B|: the map is no more probable ``with_own`` (p,).
+    """
+    return bool(parameter.likes) and bool(parameter.row[kept].any()) and (
+        whole.log_evidence(with_own) <= whole.log_evidence(kept))
+
+
+def _by_likes(
+    parameter: Parameter, kept: NDArray[np.bool_], told: EvidenceByPart
+) -> float:
+    """Return the standard deviation by others that change many maps nearly alike, in its unit."""
+    if not parameter.likes or not parameter.row.any():
+        return 0.0
+    apart = replace(parameter, row=parameter.apart_row)
+    with_likes = kept.copy()
+    with_likes[list(parameter.likes)] = True
+    alone, beside = (_shown(apart, each, told, ALIKE_PARTS) for each in (kept, with_likes))
+    return float(np.hypot(beside.sd, beside.value - alone.value))
+
+
+def _beside_likes(
+    fitted: _Fitted, terms: tuple[InstrumentTerm, ...]
+) -> tuple[InstrumentTerm, ...]:
+    """Return terms with bars that contain others which change many maps nearly alike.
+
+    A stage that was 1 % too long along z was read as +0.7 % of Bz. Which of the two is off the
+    evidence tells of most maps; but both may be, by as much as probes and stages are. Where that
+    bar is too long, those that would have been found in its place are rivals.
+    """
+    found = []
+    for term, parameter in zip(terms, all_parameters(
+            fitted.model.any_sd, fitted.model.shares(fitted.at)), strict=True):
+        sd = float(np.hypot(term.sd, term.likes_sd))
+        prior = float(np.linalg.norm(parameter.apart_row))
+        wide = replace(term, sd=sd, determined=term.determined and (
+            not term.likes_sd or sd < DETERMINED * prior))
+        lost = term.found and not (wide.found or term.rivals)
+        found.append(replace(wide, rivals=term.beaten if lost else term.rivals))
+    return tuple(found)
 
 
 def _most_probable(
@@ -1336,8 +1422,6 @@ def _shown(
     What the charges do not follow is where the field is steep, in both halves along other axes:
     the half in which it is flat must be able to tell, too.
     """
-    # A parameter is determined if its standard deviation is below this part of its prior one.
-    determined = 0.5
     if not parameter.row.any():  # it is not asked, see `all_parameters`
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True)
     used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
@@ -1356,7 +1440,7 @@ def _shown(
     prior = float(np.linalg.norm(row))
     away = float(np.abs(parts[0][0][np.isin(used, parameter.own)]).max())
     return InstrumentTerm(
-        parameter.name, parameter.unit, value, beyond * sd, beyond * sd < determined * prior,
+        parameter.name, parameter.unit, value, beyond * sd, beyond * sd < DETERMINED * prior,
         away <= doubted_from(len(kept)),
         supported or abs(value) <= SIGNIFICANT * beyond * sd)
 

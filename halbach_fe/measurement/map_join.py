@@ -67,11 +67,13 @@ from halbach_fe.measurement.probe_in_field import (
     MATRICES,
     MIXING,
     PRIOR_SD,
+    SCALES,
     SENSORS,
     Evidence,
     ProbeFit,
     State,
     fit_probe,
+    from_middle,
 )
 from halbach_fe.study.types import COMPONENTS
 
@@ -967,15 +969,16 @@ class _Joined:
         """Return the joined map, see `JoinedMaps`.
 
         What the common probe reads at the place follows from the field, what the fit leaves of a
-        reading from the map.
+        reading from the map. Places are those of a stage whose scale is right.
         """
-        there = [self.model.pose(self.at, number).places(scan.points)
-                 for number, scan in enumerate(self.scans)]
+        value = self.at.instrument * self.model.prior_sd
+        there = [self.model.pose(self.at, number).places(
+            scan.points + value[SCALES] * from_middle(scan.points))
+            for number, scan in enumerate(self.scans)]
         first = JoinedModel(self.model.charges, [replace(scan, points=points).model(
             self.model.charges) for scan, points in zip(self.scans, there, strict=True)],
             [Pose(np.eye(3), np.zeros(3))] * len(there))
-        value = self.at.instrument * self.model.prior_sd
-        value[TERMS:] = 0.0
+        value[SCALES] = value[TERMS:] = 0.0
         common = replace(self.at, instrument=value / np.where(
             first.prior_sd > 0, first.prior_sd, np.inf))
         left, read = self.model.field - self.model.readings(self.at), first.readings(common)
@@ -1092,8 +1095,8 @@ def _out_of_line(off: Floats, sd: Floats) -> NDArray[np.bool_]:
 
 
 COMMON = np.zeros(TERMS, bool)
-"""Terms that a probe has in every map; turns, drifts and offsets are of one scan."""
-COMMON[[*range(TERMS)[SENSORS], *range(TERMS)[MIXING], LAG]] = True
+"""Terms that probe and stage have in every map; turns, drifts and offsets are of one scan."""
+COMMON[[*range(TERMS)[SENSORS], *range(TERMS)[MIXING], LAG, *range(TERMS)[SCALES]]] = True
 
 
 GAINS_OF_AXES = range(MIXING.stop - 3, MIXING.stop)
@@ -1111,7 +1114,7 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
     kept = np.zeros(len(model.any_sd), bool)
     for number, one in enumerate(maps):
         for parameter in all_parameters(np.array(PRIOR_SD), np.eye(3) / 3):
-            if any(term.found and term.name == parameter.name for term in one.check.terms):
+            if any(term.is_chosen and term.name == parameter.name for term in one.check.terms):
                 own = list(parameter.own)
                 kept[own] |= COMMON[own]
                 if number and parameter.own[0] in GAINS_OF_AXES and _contradicted(
@@ -1137,12 +1140,13 @@ def _contradicted(one: Checked, maps: Sequence[Checked], axis: int) -> bool:
 
 
 def _gains(one: Checked) -> tuple[Floats, Floats]:
-    """Return the gain of each component relative to that of |B| in %, and its variance, (3,) each.
+    """Return the gain of each component relative to that of |B| in %, and its variance, (3,) each,
+    but for what maps of one stage have in common.
 
     A component along which the field is has none: it is that of |B|.
     """
     terms = {term.name: term for term in one.check.terms}
-    value, sd = np.array([(terms[name].value, terms[name].sd) if name in terms else (0.0, 0.0)
+    value, sd = np.array([(terms[name].value, terms[name].own_sd) if name in terms else (0.0, 0.0)
                           for name in (f"gain of B{axis} relative to that of |B|"
                                        for axis in COMPONENTS)]).T
     return value, sd**2

@@ -94,12 +94,15 @@ def answer(check: MapCheck, in_order: bool = True) -> Answer:
     used, named = ("DIR/oriented_map.csv",
                    "oriented_map.csv, which has the right axes and no broken rows") if better else (
         "MAP", "this map")
-    if in_order and (changed := [term for term in check.terms if term.found and _is_change(term)]):
-        fitted = all("offset" in term.name for term in changed)
-        used, named = "DIR/corrected_map.csv", (
-            "corrected_map.csv, without what changed during the scan: an update " + (
-                "fits that only if drift_T in [instrument_sd] of the study allows it" if fitted
-                else "does not fit that"))
+    changed = [term for term in check.terms if term.found and _is_change(term) and in_order]
+    scaled = [term for term in check.terms if term.found and _is_scale(term)]
+    if changed or scaled:
+        what = in_a_row([*(["what changed during the scan"] if changed else []),
+                         *(["the scale of the stage"] if scaled else [])])
+        used, named = "DIR/corrected_map.csv", f"corrected_map.csv, without {what}: an update " + (
+            "fits that only if drift_T in [instrument_sd] of the study allows it"
+            if not scaled and all("offset" in term.name for term in changed) else
+            "does not fit that by itself")
     said = f"{verdict(check)} {_noise(check, keys=True)}"
     if check.is_displaced:
         return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
@@ -283,7 +286,7 @@ def sentences(check: MapCheck) -> list[str]:
                      + (f"; and {others} more of the parameters in the table" if others > 0
                         else "")
                      + ".")
-    if any(term.name.startswith("gain of") for term in terms):
+    if any(_is_scale(term) for term in terms):
         found.append(STRETCHED)
     found += [f"One of these is off, and the map does not tell which: {'; '.join(names)}."
               for names in dict.fromkeys(tuple(sorted((term.name, *term.rivals)))
@@ -292,9 +295,10 @@ def sentences(check: MapCheck) -> list[str]:
 
 
 STRETCHED = (
-    "A stage that is stretched along an axis is read as gains that differ by about as much, which "
-    "this check does not tell apart: compare its scale with a ruler before you correct gains.")
-"""What gains of single components may be instead: of a z that was 1 % too long, +0.7 % of Bz."""
+    "A scale of −1\u00a0% says that the stage went 1\u00a0% less far along this axis than the map "
+    "states. A common scale of all axes no map can show: those that are not named are taken as "
+    "they are. corrected_map.csv has the field at the places that it states.")
+"""What a scale of the stage is."""
 
 NOT_WHOLE = (
     "{} by itself obeys where it is harmonic, as each component of a field without sources is. "
@@ -382,6 +386,11 @@ def _impossible(check: MapCheck) -> list[str]:
     """Return the names of the parameters of a probe that no probe has."""
     return [term.name for term in check.terms
             if term.determined and term.predictive and not term.plausible]
+
+
+def _is_scale(term: InstrumentTerm) -> bool:
+    """Tell whether a parameter is a scale of the stage."""
+    return term.name.startswith("scale of the stage")
 
 
 def _is_change(term: InstrumentTerm) -> bool:

@@ -138,6 +138,28 @@ def test_a_drift_that_one_check_found_is_no_term_of_the_join():
     assert fitted.sum() == 1 + 6  # the turn of the probe, and the pose of the second map
 
 
+@pytest.mark.parametrize("found", [True, False])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_scale_of_a_stage_that_the_checks_found_is_one_of_the_join(seed, found):
+    """Of a stage whose z is 1 % too long poses hold, and the joined map is that of the magnet.
+    Control: without the term places are off by 1 % of the shift, 43 and 12 bars.
+    """
+    maps, poses, magnet = campaign(seed, maps=2)
+    generator, middle = np.random.default_rng(seed), (POINTS.max(axis=0) + POINTS.min(axis=0)) / 2
+    were = middle + (POINTS - middle) / [1, 1, 1.01]
+    long = as_checked({name: read(magnet, pose, generator, were=were)
+                       for name, pose in zip(maps, poses, strict=True)})
+    term = InstrumentTerm("scale of the stage along z", "%", -1.0, 0.1, True, True)
+    joined = join_checked([replace(one, check=replace(one.check, terms=(term,) * found))
+                           for one in long], QUIET)
+    assert [one.name for one in joined.terms] == [f"{term.name}, in all maps"] * found
+    assert (np.abs(over_bars(joined, poses)).max() < 4) == found
+    turn, shift = poses[0][0].as_matrix(), poses[0][1]
+    ideal = magnet.getB(points_of(joined.data) @ turn.T + shift) @ turn
+    off = np.sqrt(np.mean((joined.data["B_T"].values - ideal)**2))
+    assert (off < 1.2 * NOISE_T) == found  # 1.0 to 1.1 were measured, and 2.1 and 14 without
+
+
 def test_the_joined_map_is_that_of_one_stage(generator):
     """A gain that only one map has is found, and taken out of the joined map."""
     maps, poses, magnet = campaign(1, maps=2)
