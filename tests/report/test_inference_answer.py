@@ -11,13 +11,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.result import (
-    HELD_OUT,
-    Amplitudes,
-    InferenceResult,
-    Stretch,
-    far_in_words,
-)
+from halbach_fe.inference.result import HELD_OUT, Amplitudes, InferenceResult, Stretch, far_in_words
 from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.words import flux_density, ppm
