@@ -158,14 +158,16 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     readings, one, field = _readings(magnet, points, session.within("instrument"))
     observation = readings.observation
     model = response_matrix(magnet, observation, session)
-    beside = _beside(magnet, readings, one, field, model.shared_error)
+    beside, neighbours = (_beside(readings, one, field, model.shared_error),
+                          neighbour_readings(magnet, [one], readings))
     errors = readings.noise.with_independent_errors(model.error)
     prior = study_prior(magnet, len(model.parameters))
-    everything = with_variations(prior, beside.shape[1])
-    whole = np.hstack([model.whole, beside])
+    everything = with_variations(prior.stacked, beside.shape[1])
+    whole = np.hstack([model.whole, neighbours, beside])
     size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(whole @ everything.root).reshape(len(points), size, -1)
-    others = errors.whiten(beside).reshape(len(points), size, -1)
+    others = errors.whiten(np.hstack([beside, seen_columns(
+        neighbours @ neighbour_prior(magnet).root, readings)])).reshape(len(points), size, -1)
     values = _values(magnet, prior, session.within("objective"))
     root = np.zeros((0, whitened.shape[2])) if values is None else np.pad(
         values.root, ((0, 0), (0, beside.shape[1])))
@@ -234,17 +236,13 @@ def _any_field(points: Floats) -> Floats:
 
 
 def _beside(
-    magnet: Magnet, readings: Readings, one: Map, field: Callable[[Floats], Floats],
-    shared_error: Floats,
+    readings: Readings, one: Map, field: Callable[[Floats], Floats], shared_error: Floats
 ) -> Floats:
     """Return readings (n, k) in T per prior standard deviation of what is open beside the
-    parameters of the magnet; ``shared_error`` (e, n) in T is the solver's.
+    parameters of magnets; ``shared_error`` (e, n) in T is the solver's.
     """
-    return np.hstack([
-        shared_error.reshape(-1, len(readings.values)).T,
-        seen_columns(neighbour_readings(magnet, [one], readings) @ neighbour_prior(magnet).root,
-                     readings),
-        open_columns(one.study, field, [one], readings)])
+    return np.hstack([shared_error.reshape(-1, len(readings.values)).T,
+                      open_columns(one.study, field, [one], readings)])
 
 
 def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:

@@ -40,6 +40,7 @@ from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.response.block_variation import prior_of_blocks
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, rotation_roots
 from halbach_fe.study.model import Study
@@ -468,7 +469,10 @@ def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:
     sd, root = np.radians(study.prior.mounting_sd_deg), np.asarray(after.root)
     if not sd:  # the prior has no mounting errors
         return after.mean, root, root
-    before = result.prior
+    before, rounding = result.prior, 1e-9
+    alone = prior_of_blocks(result.magnet)
+    if result.measured_blocks is None and (before.sd < (1 - rounding) * alone.sd).any():
+        before = alone  # that was an earlier update, which does not say what is of the mounting
     turns = linalg.block_diag(*_turn_covariance(
         before.mean.reshape(-1, study.dimension), sd))
     share = _times_inverse(turns, before.covariance)

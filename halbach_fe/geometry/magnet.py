@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from importlib import import_module
@@ -414,7 +415,8 @@ class Magnet(ShownInNotebook):
         magnet = self.with_study(self.study.with_(**changes))
         if any(getattr(magnet.study, key) != getattr(self.study, key)
                for key in MAGNET_KEYS | {"external"}):
-            _doubt_sources(magnet)
+            known = _doubts_of_sources(self)
+            _ask(magnet, [each for each in _doubts_of_sources(magnet) if each not in known])
         return magnet
 
     def with_study(self, study: Study) -> Magnet:
@@ -451,13 +453,13 @@ def build_magnet(study: Study) -> Magnet:
     'r01s01'
     """
     magnet = _built(study)
-    _doubt_sources(magnet)
+    _ask(magnet, _doubts_of_sources(magnet))
     return magnet
 
 
-def _doubt_sources(magnet: Magnet) -> None:
-    """Warn of fields from outside that no surroundings have, and of sources that are so far from
-    each other along z that this may be in mm; a search may try them.
+def _doubts_of_sources(magnet: Magnet) -> list[str]:
+    """Return sentences about fields from outside that no surroundings have, and about sources that
+    are so far from each other along z that this may be in mm; a search may try them.
     """
     doubts = magnet.external.doubts
     if magnet.dimension == 3:
@@ -473,6 +475,11 @@ def _doubt_sources(magnet: Magnet) -> None:
                 f"blocks, neighbours and iron leave {far:.3g} m between each other along z, and "
                 f"reach {radius:.3g} m from the axis: there is hardly any field in between. Are "
                 "z_m or gaps in mm? Then write 0.01 for 10 mm.")
+    return doubts
+
+
+def _ask(magnet: Magnet, doubts: Sequence[str]) -> None:
+    """Warn of what is doubted of a magnet."""
     for doubt in doubts:
         warnings.warn(f"Study {magnet.name}: {doubt}", HalbachWarning, stacklevel=4)
 

@@ -160,18 +160,15 @@ class Study(StudyModel, metaclass=_OfKeys):
     @model_validator(mode="before")
     @classmethod
     def _with_grade(cls, given: Any) -> Any:
-        """Fill in what the grade of the array's material says about prior and demagnetization."""
+        """Fill in what grades say about prior, and that of the array about demagnetization."""
         if not isinstance(given, dict) or not isinstance(array := given.get("array"), dict):
             return given  # a validated array has been through here
-        found = grade_of({"material": common_material(array)})
-        if found is None:
-            return given
-        values = dict(given)
-        prior = values.get("prior", {})
-        if isinstance(prior, dict) and prior.get("common_mode_sd") is None:
-            values["prior"] = {"remanence_sd": remanence_sds(array)} | prior
+        values, found = dict(given), grade_of({"material": common_material(array)})
+        prior, sds = values.get("prior", {}), remanence_sds(array)
+        if sds and isinstance(prior, dict) and prior.get("common_mode_sd") is None:
+            values["prior"] = {"remanence_sd": sds} | prior
         demagnetization = values.get("demagnetization")
-        if isinstance(demagnetization, dict):
+        if found is not None and isinstance(demagnetization, dict):
             values["demagnetization"] = found.demagnetization_defaults | demagnetization
         return values
 

@@ -661,14 +661,6 @@ def test_noise_that_is_none(sigma):
         hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)
 
 
-def test_a_result_without_a_page(tmp_path):
-    """As docs/from-python.md says; the refusal names the command that writes its files."""
-    found = hf.field(hf.halbach_ring(**RING | {"length_m": 0.05}),
-                     hf.Lines((0, 0, -0.01), (0, 0, 0.01), count=3))
-    with pytest.raises(hf.HalbachError, match=r"and hf\.field the commands"):
-        hf.write_report(found, tmp_path)
-
-
 def test_noise_that_a_plan_misses():
     """Where there is no map yet, none is spoken of. Control: an inference asks for its sigma_T."""
     ring = hf.halbach_ring(**RING | {"length_m": 0.05}).with_(noise=None)

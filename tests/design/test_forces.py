@@ -333,6 +333,7 @@ SPHERES = [{"kind": "sphere", "radius_m": 0.01, "centre_m": [0.0, 0.0, z]} for z
 
 
 @pytest.mark.filterwarnings("ignore:.*earth's field")
+@pytest.mark.filterwarnings("ignore:.*leave 0.4.. m between each other along z")
 def test_two_spheres_pull_one_another(tmp_path):
     """In a uniform field, far from the block: nearly as two dipoles 60 mm apart."""
     found = found_of(beside(*SPHERES, external={"background_T": [0.0, 0.0, 0.5]}, growth=1.8),
@@ -353,6 +354,7 @@ def test_two_spheres_pull_one_another(tmp_path):
     assert shown.summary["iron"][0]["force_N"][2] == found.iron.force_N[0, 2]
 
 
+@pytest.mark.filterwarnings("ignore:.*leave 0.4.. m between each other along z")
 def test_a_coil_pulls_a_sphere(tmp_path):
     """As the dipole that its field induces is pulled: alpha grad B^2 / (2 mu_0)."""
     coil = {"kind": "round", "radius_m": 0.05, "section_m": [0.0, 0.0], "current_A": 1e4,

@@ -197,6 +197,20 @@ def test_a_new_mounting_undoes_the_old_one(session):
     assert np.sqrt(np.mean(np.square(naive))) > 1.3
 
 
+def test_blocks_are_taken_out_after_two_updates_as_after_one(session):
+    """The prior of the second update is the first, which knows the blocks better than their
+    mounting does: their bars were 31 times as long.
+    """
+    study = study_of(**SQUARES, prior__mounting_sd_deg=0.5)
+    data, magnet = campaign(study, 0)[0].readings, build_magnet(study)
+    first, second = (data.isel(point=slice(start, None, 2)) for start in range(2))
+    update = infer(magnet, second, session, prior=infer(magnet, first, session).posterior)
+    (mean, loose, _), (same, other, _) = map(taken_out, (infer(magnet, data, session), update))
+    sd = np.linalg.norm(loose, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(other, axis=1), sd, rtol=1e-6)
+    np.testing.assert_allclose(same, mean, atol=1e-3 * sd.min())
+
+
 def test_gains_are_those_of_samples(generator):
     """Mean and sd of the fall of a quadratic form, by 20 000 draws: the sd to 1 %, as its tails are
     long.

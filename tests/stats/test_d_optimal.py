@@ -17,11 +17,14 @@ from halbach_fe.design.measurement_plan import (
     spread,
     variance_left,
 )
+from halbach_fe.design.objective import deviation_model
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
+from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.matrix import response_matrix
+from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
@@ -66,12 +69,14 @@ def test_information_about_what_is_beside_does_not_count(generator):
     ids=["exact", "gain", "pose", "uncertain", "neighbour"])
 def test_a_plan_knows_the_blocks_as_an_update_will(open_):
     """Standard deviations are those of an update at the same positions, by all that the study
-    leaves open: with a gain of 2 % they were 2.3 times too short. The update is about the readings,
-    which changes the derivatives by the pose by a per cent.
+    leaves open: with a gain of 2 % they were 2.3 times too short, and the deviation of |B| beside
+    a neighbour was 20 times too uncertain. The update is about the readings, which changes the
+    derivatives by the pose by a per cent.
     """
     magnet = hf.halbach_ring(
         blocks=8, inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.06, remanence_T=1.2).with_(
-            noise={"regions": [{"name": "all", "sigma_T": 1e-5}]}, inference={}, observation={
+            noise={"regions": [{"name": "all", "sigma_T": 1e-5}]}, inference={},
+            homogeneity={"sphere_m": 0.01}, observation={
                 "quantity": "flux_density", "positions": {
                     "kind": "grid", "start_m": [-0.01, -0.01, -0.03], "end_m": [0.01, 0.01, 0.03],
                     "count": [3, 3, 5]}}, **open_)
@@ -80,6 +85,10 @@ def test_a_plan_knows_the_blocks_as_an_update_will(open_):
     update = hf.infer(magnet, hf.field_map(points, magnet.field_T(points)))
     np.testing.assert_allclose(planned.baseline_sd, update.posterior.sd, rtol=0.03)
     assert planned.gain[-1] == pytest.approx(planned.baseline_gain[-1], rel=1e-6)
+    known = deviation_model(homogeneity_model(
+        magnet, hf.Region.sphere(0.01), Session.temporary())).of(update.posterior)
+    assert planned.deviation.planned[-1] == pytest.approx(
+        np.linalg.norm(known.root), rel=0.03)
 
 
 def test_greedy_is_near_the_best(generator):

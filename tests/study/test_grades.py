@@ -64,6 +64,7 @@ CUBES = {"name": ["a", "b"], "shape": ["cuboid"] * 2, "x_m": [0.04, -0.04], "y_m
     (RINGS | {"ring": [{"material": "N42"}, {"material": "N48"}]}, ["N42", "N48"]),
     (RINGS | {"material": "N42", "ring": [{}, {"material": "N48"}]}, ["N42", "N48"]),
     ({"free_blocks": CUBES | {"material": ["N42", "N48"]}}, ["N42", "N48"]),
+    (RINGS | {"ring": [{"remanence_T": 1.3}, {"material": "N48"}]}, ["N48"]),
     # negative controls: a strength that is stated is that of no range, and another one is not there
     (RINGS | {"remanence_T": 1.3, "ring": [{}, {}]}, []),
     (RINGS | {"ring": [{"material": "N42", "remanence_T": 1.3}] * 2}, []),
