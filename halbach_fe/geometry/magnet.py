@@ -463,11 +463,12 @@ def _doubts_of_sources(magnet: Magnet) -> list[str]:
     """
     doubts = magnet.external.doubts
     if magnet.dimension == 3:
-        blocks = (*magnet.blocks, *neighbour_blocks(magnet.blocks, magnet.external.neighbours))
         half = np.array([-0.5, 0.5])
-        ends = np.array(sorted([tuple(one.mounted_middle[2] + half * (one.z_max - one.z_min))
-                                for one in blocks] + [
-            (float(body.surface[2].min()), float(body.surface[2].max())) for body in magnet.iron]))
+        own = np.array([one.mounted_middle[2] + half * (one.z_max - one.z_min)
+                        for one in magnet.blocks])
+        ends = np.vstack([own, *(own + one.z_m for one in magnet.external.neighbours), *(
+            [body.surface[2].min(), body.surface[2].max()] for body in magnet.iron)])
+        ends = ends[np.lexsort(ends.T[::-1])]
         gaps, radius = ends[1:, 0] - np.maximum.accumulate(ends[:-1, 1]), magnet.radius
         if (far := float(gaps.max(initial=0.0))) and look_like_mm(
                 np.array([[far, 0.0, 0.0]]), radius)[0]:
