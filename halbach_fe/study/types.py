@@ -184,6 +184,7 @@ class StudyModel(BaseModel):
         """
         values = {name: getattr(self, name) for name in type(self).model_fields}
         where = f"changed {type(self).__name__}"
+        keys: dict[str, dict[str, Any]] = {}  # of tables; together, as they may need each other
         for key, value in changes.items():
             name, nested, rest = key.partition("__")
             if name not in values:
@@ -196,7 +197,12 @@ class StudyModel(BaseModel):
                     f"`{name}`", where, f"a table, for `{key}` to change a key of it",
                     sentences.received(values[name]),
                     f"Give `{name}` as a whole."))
-            values[name] = values[name].with_(**{rest: value}) if nested else value
+            if nested:
+                keys.setdefault(name, {})[rest] = value
+            else:
+                values[name] = value
+        for name, changed in keys.items():
+            values[name] = values[name].with_(**changed)
         try:
             return type(self).model_validate(values)
         except ValidationError as error:

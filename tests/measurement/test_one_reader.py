@@ -157,6 +157,17 @@ def test_times_that_may_be_minutes_and_seconds(tmp_path, header):
     assert whole.data["time_s"].values.tolist() == [0.0, 61.0, 123.0]
 
 
+def test_of_two_columns_of_times_the_one_in_a_unit_is_read(tmp_path):
+    """Times of day beside it were said to be none. Control: alone they are read."""
+    rows = zip(("23:59:58", "23:59:59", "00:00:01"), (0, 1, 3), strict=True)
+    found = timed(tmp_path, "time,time_s", [f"{clock},{t}" for clock, t in rows])
+    assert found.data["time_s"].values.tolist() == [0.0, 1.0, 3.0]
+    assert "The times in 'time' are not used: those in 'time_s' are." in found.remarks
+    alone = timed(tmp_path, "time", ("23:59:58", "23:59:59", "00:00:01"))
+    assert alone.data["time_s"].values.tolist() == [0.0, 1.0, 3.0]
+    assert not [said for said in alone.remarks if "not used" in said]
+
+
 def test_own_times_that_are_no_seconds_are_refused(tmp_path):
     path = tmp_path / "map.csv"
     lines = "".join(f"0,0,0.0{n},0.1,{t}\n" for n, t in enumerate((142355, 142359, 142401)))

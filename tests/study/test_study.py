@@ -415,6 +415,17 @@ def test_with_refuses_keys_and_tables_that_are_not_there(change, said):
     assert study.with_(array__remanence_T=1.2).array.remanence_T == 1.2  # the control
 
 
+def test_keys_of_a_table_that_need_each_other_are_changed_together():
+    """They were changed one after the other, and refused. Control: one of them alone still is."""
+    study = parse_study(DIPOLE, "study file x.toml")
+    both = {"prior__temperature_coefficient_per_K": -1e-3, "prior__reference_temperature_C": 20.0}
+    prior = study.with_(**both).prior
+    assert (prior.temperature_coefficient_per_K, prior.reference_temperature_C) == (-1e-3, 20.0)
+    assert prior.magnitude_sd == study.prior.magnitude_sd
+    with pytest.raises(StudyError, match="together, or neither"):
+        study.with_(prior__reference_temperature_C=20.0)
+
+
 def test_a_map_in_place_of_the_study(tmp_path):
     """Of the two files of most commands, the study comes first. Control: a line of a study."""
     for name, said in (("map.csv", "take the study file first"), ("s.toml", "Correct that line")):

@@ -360,6 +360,10 @@ def _remarks(
                         "field that changes in time only the real part was read.")
         elif names.is_time(column):
             why = "their unit is not stated"
+            if "t" in used:
+                said.append(f"The times in '{column.text}' are not used: those in "
+                            f"'{columns[used['t']].text}' are.")
+                continue
             if table.texts.get(index):
                 why = "they are neither times of day HH:MM:SS nor stamps 2024-05-31T14:23:59"
             elif look_like_clock(values):
