@@ -661,6 +661,12 @@ def test_noise_that_is_none(sigma):
         hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)
 
 
+def test_a_result_without_a_page(tmp_path):
+    """What no function has returned; the refusal names the commands that write such files."""
+    with pytest.raises(hf.HalbachError, match="the commands of these names write the"):
+        hf.write_report(POINTS, tmp_path)
+
+
 def test_noise_that_a_plan_misses():
     """Where there is no map yet, none is spoken of. Control: an inference asks for its sigma_T."""
     ring = hf.halbach_ring(**RING | {"length_m": 0.05}).with_(noise=None)
