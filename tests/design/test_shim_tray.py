@@ -251,7 +251,8 @@ def test_a_tray_that_cannot_help_stays_empty(measured, tmp_path):
 @pytest.mark.parametrize(("changes", "said"), [
     ({"rings": [{"radius_m": 0.098, "count": 8, "z_m": 0.035}]}, "place 1 .*touches block"),
     ({"rings": [{"radius_m": 0.3, "count": 8}]}, "within the magnet"),
-    ({"rings": [{"radius_m": 0.08, "count": 8, "z_m": [-20.0, 0.0, 20.0]}]}, "Is it in metres"),
+    ({"rings": [{"radius_m": 0.08, "count": 8, "z_m": [-20.0, 0.0, 20.0]}]},
+     "Was it meant in millimetres"),
     ({"rings": [{"radius_m": 0.025, "count": 4}]}, "touches the region"),
     ({"rings": [{"radius_m": 0.0345, "count": 4}]}, "touches the region"),
     ({"rings": [{"radius_m": 0.08, "count": 70}]}, "touches that of place"),
