@@ -449,8 +449,8 @@ class NoiseCovariance:
             if conditional_variance.min() < singular:
                 raise _covariance_error(
                     "positive definite", "a singular or indefinite matrix, as if the noise of a "
-                    "reading were the sum of others", "Is sigma far too small beside what the gradient of the field "
-                    "makes of noise.position_sd_m?")
+                    "reading were the sum of others", "Is sigma far too small beside what the "
+                    "gradient of the field makes of noise.position_sd_m?")
             parts.append((index, scale[:, :, None] * lower,
                           np.linalg.inv(lower) / scale[:, None, :]))
         rows = np.concatenate([np.repeat(index, index.shape[1], axis=1).ravel()
