@@ -447,8 +447,10 @@ class NoiseCovariance:
             except np.linalg.LinAlgError:
                 conditional_variance = np.zeros(1)
             if conditional_variance.min() < singular:
-                raise _covariance_error("positive definite", "a singular or indefinite matrix, as "
-                                        "if the noise of a reading were the sum of others")
+                raise _covariance_error(
+                    "positive definite", "a singular or indefinite matrix, as if the noise of a "
+                    "reading were the sum of others", "Is sigma far too small beside what the "
+                    "gradient of the field makes of noise.position_sd_m?")
             parts.append((index, scale[:, :, None] * lower,
                           np.linalg.inv(lower) / scale[:, None, :]))
         rows = np.concatenate([np.repeat(index, index.shape[1], axis=1).ravel()
@@ -541,9 +543,9 @@ def independent_noise(sd: Floats) -> NoiseCovariance:
     return NoiseCovariance(sparse.csr_array(sparse.diags_array(np.asarray(sd, float) ** 2)))
 
 
-def _covariance_error(expected: str, received: str) -> MeasurementError:
+def _covariance_error(expected: str, received: str, advice: str = "") -> MeasurementError:
     """Return the error that says how a covariance must be, and what was received."""
-    return MeasurementError(must_be("covariance", "the noise", expected, received))
+    return MeasurementError(must_be("covariance", "the noise", expected, received, advice))
 
 
 def _blocks(covariance: sparse.csr_array) -> Iterator[tuple[Ints, Floats]]:
