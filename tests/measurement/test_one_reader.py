@@ -124,6 +124,17 @@ def timed(tmp_path, header, cells, **declared):
         f"{cell},0,0,{n},100\n" for n, cell in enumerate(cells)), **declared)
 
 
+@pytest.mark.parametrize(("head", "right"), [
+    ("x/(mm);y/(mm);z/(mm);Hx/(kA/m)", 4e-2 * np.pi),
+    ("x_mm;y_mm;z_mm;Hx_kA/m", 4e-2 * np.pi),
+    ("x / mm;y / mm;z / mm;Bx in kA/m", 4e-2 * np.pi), ("x/mm;y/mm;z/mm;Bx/mT", 0.1)])
+def test_units_behind_a_slash(tmp_path, head, right):
+    """Refused: of kA/m the unit was m, and a slash before brackets belonged to the name."""
+    found = imported(tmp_path, f"{head}\n1;2;3;100\n2;2;3;100\n").data
+    np.testing.assert_allclose(found["B_T"].sel(component="x"), right, rtol=1e-6)
+    assert float(found["x_m"][0]) == 0.001
+
+
 def test_hhmmss(tmp_path):
     """142359 is 14:23:59, two seconds before 142401; as seconds it would be 42."""
     cells = (142355, 142359, 142401)

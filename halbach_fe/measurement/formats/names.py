@@ -250,12 +250,12 @@ def is_time(column: ColumnName) -> bool:
 def split_unit(text: str) -> tuple[str, str]:
     """Split a name into the quantity and the unit, which is empty if the name has none."""
     if found := BRACKETS.fullmatch(text):
-        return found[1], found[2]
-    for mark in ("/", "_", ",", " in ", " "):
+        return found[1].rstrip("/ "), found[2]  # Hx/(kA/m), as ISO 80000 writes it
+    for mark in ("_", ",", " in ", " ", "/"):  # of Hx_kA/m the unit is not m
         base, _, unit = text.rpartition(mark)
         if base and (unit_symbol(unit) or (
                 _key(base) in TIME_NAMES and (unit in TIMES or CLOCK.fullmatch(unit)))):
-            return base, unit
+            return base.rstrip("/ "), unit
     return text, ""
 
 
