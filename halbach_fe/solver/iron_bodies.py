@@ -628,7 +628,7 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     hint, key = "Leave out thin bodies of iron.", "growth"
     # half the memory is left to others
     enough = available / gib_each / 2 * estimate / unknowns
-    tried = [("block_size_m", magnet.study.array.outer_radius_m), ("growth", 3.0)]
+    tried = [("block_size_m", magnet.study.array.outer_radius_m), ("growth", 4.0)]
     for name, most in tried:
         values = (float(f"{one:.2g}") for one in np.geomspace(getattr(mesh, name), most, 30)[1:-1])
         if found := next((one for one in values if Sizes.of(mesh.with_(**{name: one}), coarseness)
