@@ -398,7 +398,7 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
 @pytest.mark.parametrize("body", [SPHERE, TUBE], ids=["sphere", "tube"])
 def test_bars_cover_at_the_largest_growth(session, body, generator):
     """Of 60 readings 2 to 30 mm off, 95 % lie within two bars of the truth: the closed form, or a
-    finer mesh. Of a sphere both meshes were the same and bars were 0; of the tube a tenth did.
+    finer mesh. Of a sphere both meshes were the same and bars 0; of the tube none did.
     """
     background = np.array([0.3, -0.2, 1.0])
     solved, finer = (solve_bodies(
