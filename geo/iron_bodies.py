@@ -32,6 +32,8 @@ class Sizes:
     thickness: float
     """Largest size relative to the ratio of a body's volume and surface, half the thickness of a
     plate."""
+    whole: float
+    """Largest size relative to the cube root of a body's volume."""
     curvature: float
     """Largest size relative to the radius of a round body."""
     edge: float
@@ -46,15 +48,20 @@ class Sizes:
         """Return those of a study; a larger ``coarseness`` is for error bars."""
         usual = 0.4  # growth - 1 for which the numbers below are
         relative = coarseness * (mesh.growth - 1) / usual
-        return cls(coarseness * mesh.block_size_m, 1.2 * relative, min(0.35 * relative, 1.0), 0.35,
-                   0.3 * relative, 0.8 * relative**0.5)
+        # Of larger elements a body would have so few that a coarser mesh, for error bars, cannot be
+        # twice as coarse: the change by it was a third of the error of a box or a tube, and nothing
+        # for a sphere. Only sheets, whose size is many times their thickness, get larger ones.
+        whole, fewest = 0.3 * coarseness, min(relative, 1.5 * coarseness)
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, whole, min(0.35 * fewest, 1.0),
+                   0.35, 0.3 * fewest, 0.8 * fewest**0.5)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
         volume, surface, _ = body.measures
         flat = body.outline or (body.triangles is not None and body.profile is None)
         round_body = np.inf if flat else self.curvature * body.outer_radius
-        return min(self.iron, self.thickness * volume / surface, round_body)
+        return min(self.iron, self.thickness * volume / surface, self.whole * volume ** (1 / 3),
+                   round_body)
 
     def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
         """Estimate the numbers of elements and of unknowns of the mesh, right to a third or so.

@@ -44,6 +44,8 @@ from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
 from tests.geometry.test_iron import CHAMFERED, draw_prism, stl_of_step, triangles_of_box
 
 SPHERE = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.0, 0.05]}
+TUBE = {"kind": "tube", "inner_radius_m": 0.01, "outer_radius_m": 0.02, "length_m": 0.03,
+        "centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
 POINTS = np.array([[0.0, 0.0, 0.0], [0.01, 0.02, 0.02], [0.03, 0.0, 0.05], [0.0, -0.03, 0.09]])
 
 
@@ -232,8 +234,8 @@ def test_a_profile_is_as_a_tube(session):
             [inner, -0.015], [inner, 0.015], [0.02, 0.015], [0.02, -0.015]]}
           for inner in (0.01, 0.0)))
     scale = np.abs(tube).max()
-    assert np.abs(profile - tube).max() < 0.01 * scale  # 0.3 % were measured
-    assert np.abs(full - tube).max() > 0.02 * scale
+    assert np.abs(profile - tube).max() < 0.005 * scale  # 0.3 % were measured
+    assert np.abs(full - tube).max() > 0.015 * scale  # 1.8 % by the bore
 
 
 SLAB = {"kind": "box", "size_m": [0.03, 0.002, 0.03], "centre_m": [0.05, 0.0, 0.0]}
@@ -316,7 +318,7 @@ def test_edges_at_narrow_gaps_have_small_elements():
     touching, glued, narrow, wide = (
         nodes_of(lower, upper | {"centre_m": [0.05, 0.0, 0.01 + gap]})
         for gap in (0.0, 1e-5, 1e-3, 0.02))
-    assert narrow > 1.2 * wide  # 1.29 was measured
+    assert narrow > 1.3 * wide
     assert touching < 1.1 * wide
     assert narrow < glued < 10 * wide
 
@@ -381,7 +383,7 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
                        [0.0, 0.0, 0.03], [0.018, 0.0, 0.06]])
     coarse, fine = (solve_bodies(
         build_magnet(study_with(body, mesh={"block_size_m": 0.02, "growth": growth})), uniform,
-        session.within(name)) for name, growth in (("coarse", 1.7), ("fine", 1.4)))
+        session.within(name)) for name, growth in (("coarse", 1.9), ("fine", 1.5)))
     found, change = coarse.field_with_errors(points)
     bars = np.linalg.norm(change, axis=1)
     plain = iron_bodies._field_of(coarse.problem, coarse.polarization, points)
@@ -391,6 +393,29 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
     # the first one is too near to its elements: it stays as it was, and its bar is longer
     assert np.sqrt(np.mean(off[1:]**2)) < 0.5 * np.sqrt(np.mean(before[1:]**2))
     assert (before > bars).any()  # the control
+
+
+@pytest.mark.parametrize("body", [SPHERE, TUBE], ids=["sphere", "tube"])
+def test_bars_cover_at_the_largest_growth(session, body, generator):
+    """Of 60 readings 2 to 30 mm off, 95 % lie within two bars of the truth: the closed form, or a
+    finer mesh. Of a sphere both meshes were the same and bars 0; of the tube none did.
+    """
+    background = np.array([0.3, -0.2, 1.0])
+    solved, finer = (solve_bodies(
+        build_magnet(study_with(body, mesh={"block_size_m": 0.02, "growth": growth})),
+        lambda points: np.broadcast_to(background, points.shape), session.within(name), estimate)
+        for name, growth, estimate in (("coarse", 4.0, True), ("fine", 1.5, body is TUBE)))
+    direction = generator.normal(size=(60, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    around = 0.02 if body is SPHERE else 0.025  # m, a radius that encloses the body
+    points = (around + generator.uniform(0.002, 0.03, (60, 1))) * direction
+    places = np.add(points, [0.0, 0.0, 0.05])
+    truth = (sphere_in_uniform_field(background, 1000.0, 0.02, points) if body is SPHERE
+             else finer.field(places))
+    found, change = solved.field_with_errors(places)
+    error, bars = (np.linalg.norm(each, axis=1) for each in (found - truth, change))
+    assert np.mean(error <= 2 * bars) >= 0.95
+    assert np.sqrt(np.mean(bars**2)) < 10 * np.sqrt(np.mean(error**2))  # the control
 
 
 def test_the_updated_magnet_is_extrapolated_as_the_model_is(session, coarse_mesh):
@@ -568,7 +593,7 @@ def test_a_turned_tube_is_as_by_azimuthal_modes(session):
     """A steel cylinder beside a permeable block, upside down: the other solver, non-linear."""
     tube = {"kind": "tube", "inner_radius_m": 0.0, "outer_radius_m": 0.02, "length_m": 0.03,
             "centre_m": [0.0, 0.0, 0.05]}
-    make = partial(study_with, permeability=1.05, mesh={"block_size_m": 0.02, "growth": 1.6},
+    make = partial(study_with, permeability=1.05, mesh={"block_size_m": 0.02, "growth": 1.8},
                    iron={"curve": {"kind": "steel", "name": "aisi_1010"}})
     modes, bodies = (build_magnet(make(body)) for body in (
         tube, tube | {"rotation_deg": [180.0, 0.0, 0.0]}))
