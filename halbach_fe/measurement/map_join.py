@@ -1109,16 +1109,20 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
     What changes during a scan is not taken from the check of a map alone. A stage that goes along
     the magnet makes a drift of the gain one along the field, which what the charges do not follow
     may feign: 3 % in a map of a dipole moved its neighbour by 0.2 mm, 7 bars. A gain of a component
-    that another check contradicts is one of its map only, too.
+    that another check contradicts is one of its map only, too. A scale must be found with
+    certainty: one of 0.9 % along y, which a map near the blocks preferred to gains, moved its
+    neighbour by 0.6 mm.
     """
     kept = np.zeros(len(model.any_sd), bool)
     for number, one in enumerate(maps):
         for parameter in all_parameters(np.array(PRIOR_SD), np.eye(3) / 3):
-            if any(term.is_chosen and term.name == parameter.name for term in one.check.terms):
-                own = list(parameter.own)
+            own = list(parameter.own)
+            is_scale = own[0] in range(TERMS)[SCALES]
+            if any((term.found if is_scale else term.is_chosen) and term.name == parameter.name
+                   for term in one.check.terms):
                 kept[own] |= COMMON[own]
-                if number and parameter.own[0] in GAINS_OF_AXES and _contradicted(
-                        one, maps, parameter.own[0] - GAINS_OF_AXES.start):
+                if number and own[0] in GAINS_OF_AXES and _contradicted(
+                        one, maps, own[0] - GAINS_OF_AXES.start):
                     kept[_gains_of(model, number)] = True
         if number:
             kept[np.arange(len(kept))[model.placed(number)][:6]] = True
