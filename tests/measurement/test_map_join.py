@@ -121,14 +121,19 @@ def test_three_maps_lie_where_they_were_made(seed):
 
 
 def test_a_drift_that_one_check_found_is_no_term_of_the_join():
-    """It may be a slope along the slow axis, which moves the other map. What the probe has in every
-    map is taken over, the control.
+    """It may be a slope along the slow axis, which moves the other map. Nor is a scale of the stage
+    that a check preferred to gains, without finding it. What the probe has in every map is taken
+    over, the control.
     """
     maps = as_checked(campaign(2, maps=2)[0])
     terms = tuple(InstrumentTerm(name, unit, 1.0, 0.1, True, True) for name, unit in (
         ("change of the gain from start to end", "%"), ("probe turned about z", "mrad")))
     assert all(term.found for term in terms)
-    found = [replace(one, check=replace(one.check, terms=terms)) for one in maps]
+    # of the measured dipole's end; as a term of both maps it moved one by 0.6 mm
+    scale = InstrumentTerm("scale of the stage along y", "%", 0.8, 0.65, False, True,
+                           likes_sd=0.648)
+    assert scale.is_chosen
+    found = [replace(one, check=replace(one.check, terms=(*terms, scale))) for one in maps]
     charges = Charges.around(points_of(maps[0].data), 0.03)
     model = JoinedModel(charges, [scan_of(one.data)[0].model(charges) for one in maps],
                         [Pose(np.eye(3), np.zeros(3))] * 2)
