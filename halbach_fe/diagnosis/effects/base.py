@@ -236,7 +236,8 @@ class Effect(ABC):
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters.
 
-        By default, that by `magnetization_change` in vacuum.
+        By default, that by `magnetization_change` in vacuum. An effect that is applied in full may
+        add those of its refinements, by which its places are then compared.
         """
         change = self.magnetization_change(nominal, place)
         if change is None:

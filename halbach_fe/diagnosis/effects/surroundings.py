@@ -218,10 +218,10 @@ blocks has 0.19, and one 0.2 m off 0.05: that one is no candidate."""
 class IronRingEffect(Effect):
     """A coaxial tube of soft iron as long as the magnet surrounds it.
 
-    A place is a pair of inner and outer radius, and the refinements adjust both, and the
-    polarization at which the iron saturates. It is not left out: blocks take up what a linear tube
-    cannot explain, and those of a magnet in a saturating tube of 4.6 mm were up to 31 standard
-    deviations (1 % of a block) off.
+    A place is a pair of inner and outer radius. The refinements adjust both, the polarization at
+    which the iron saturates, and its permeability at weak fields. With linear iron in place of it,
+    blocks took up what that could not explain: in a tube of 4.6 mm that saturates they were up to
+    31 standard deviations (1 % of a block) off.
     """
 
     name = "iron_ring"
