@@ -11,7 +11,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from time import process_time
 
 import gmsh
 import numpy as np
@@ -26,7 +25,7 @@ from halbach_fe.geometry.iron import _slit
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.iron import closed_surface
 from halbach_fe.study.reader import parse_study, read_study
-from tests.conftest import DIPOLE, changed
+from tests.conftest import DIPOLE, changed, processor_time
 
 SIZE = DIPOLE["array"]["outer_radius_m"]
 WEDGE = [[0.2, -0.01], [0.23, -0.02], [0.25, 0.0], [0.23, 0.02], [0.2, 0.01]]
@@ -216,22 +215,19 @@ def test_many_holes_are_cut_out_soon(short_dipole):
     """
     body, volume = plate_with_holes(4)
     plate = short_dipole(iron={"relative_permeability": 2.0, "bodies": [body]}).iron.bodies[0]
-    began = process_time()
-    _slit(np.array(plate.outline_m), [hole.corners for hole in plate.holes])
-    slits = process_time() - began
-    began = process_time()
-    (solid,) = magnet_of(short_dipole, body).iron
-    first = process_time() - began
+    slits = processor_time(_slit, np.array(plate.outline_m), [hole.corners for hole in plate.holes])
+    first = processor_time(magnet_of, short_dipole, body)
     assert slits < first / 3
+    (solid,) = magnet_of(short_dipole, body).iron
     assert solid.measures[0] == pytest.approx(volume, rel=1e-9)
     ends = np.isclose(np.ptp(solid.triangles[..., 2], axis=1), 0)
     a, b, c = np.moveaxis(solid.triangles[ends], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     chords = np.sinc(2 / 48)
     assert area == pytest.approx(2 * (1 - 16 * chords * np.pi * 0.075**2), rel=1e-9)
-    began = process_time()
-    (again,) = magnet_of(short_dipole, body | {"length_m": 0.03}).iron
-    assert process_time() - began < first / 3  # its section has been cut before
+    longer = body | {"length_m": 0.03}  # its section has been cut before
+    assert processor_time(magnet_of, short_dipole, longer) < first / 3
+    (again,) = magnet_of(short_dipole, longer).iron
     assert again.measures[0] == pytest.approx(1.5 * volume, rel=1e-9)
 
 
@@ -343,11 +339,10 @@ def test_many_copies_are_compared_soon():
     def seconds(repeats):
         row = BOX | {"centre_m": [9.0, 9.0, 9.0], "repeats": repeats, "step_m": [1e-3, 0.0, 0.0],
                      "mirrored": ["x", "y", "z"]}
-        began = process_time()
-        study = parse_study(changed(DIPOLE, dimension=3, array__ring_length_m=0.08, iron={
-            "relative_permeability": 9, "bodies": [row]}))
-        assert len(study.iron.each) == 8 * repeats
-        return process_time() - began
+        document = changed(DIPOLE, dimension=3, array__ring_length_m=0.08, iron={
+            "relative_permeability": 9, "bodies": [row]})
+        assert len(parse_study(document).iron.each) == 8 * repeats
+        return processor_time(parse_study, document)
 
     assert seconds(512) < 80 * seconds(32)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import h5py
 import numpy as np
@@ -229,10 +228,7 @@ def test_100_000_blocks(tmp_path):
         "recoil_permeability": [1.05] * count}
     write_free_blocks(columns, tmp_path / "blocks.csv")
     (tmp_path / "study.toml").write_text(STUDY, encoding="utf-8")
-    start = time.process_time()
     study = read_study(tmp_path / "study.toml")
-    reading = time.process_time() - start
-    start = time.process_time()
-    study.with_(mesh__growth=1.7, array__recoil_permeability=1.06)
-    assert time.process_time() - start < reading / 3  # a twelfth was measured
+    other = study.with_(mesh__growth=1.7, array__recoil_permeability=1.06)
+    assert other.array.free_blocks is study.array.free_blocks  # validation makes another object
     assert study.array.free_blocks.remanence_x_T == tuple(columns["remanence_x_T"])
