@@ -18,8 +18,7 @@ import numpy as np
 from benchmarks.note import Note
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.design.ring_catalogue import Catalogue
-from halbach_fe.design.ring_design import task_of
-from halbach_fe.design.ring_search import Task, search
+from halbach_fe.design.ring_design import Task, search, task_of
 from halbach_fe.response.region import Region
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study

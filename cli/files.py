@@ -247,7 +247,7 @@ def import_blocks(arguments: argparse.Namespace) -> int:
     """
     from halbach_fe.measurement.block_table import write_blocks
     from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
-    from halbach_fe.study.free_blocks_file import write_free_blocks
+    from halbach_fe.study.free_blocks import write_free_blocks
 
     common.own_file(arguments, arguments.file)
     table = import_blocks(arguments.file, declared(arguments, DeclaredBlocks))
@@ -289,7 +289,7 @@ def export(arguments: argparse.Namespace) -> int:
     """
     from halbach_fe.geometry.array_layout import beside_blocks, blocks_table
     from halbach_fe.measurement.formats.files import export_map
-    from halbach_fe.study.free_blocks_file import write_free_blocks
+    from halbach_fe.study.free_blocks import write_free_blocks
 
     if arguments.format != "blocks":
         common.own_file(arguments, arguments.input)

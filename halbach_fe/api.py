@@ -70,8 +70,7 @@ from halbach_fe.response.region import SHOWN_DEGREES, Region, default_region
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.free_blocks_file import write_free_blocks
+from halbach_fe.study.free_blocks import FreeBlocks, write_free_blocks
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign

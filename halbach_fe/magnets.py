@@ -31,8 +31,14 @@ from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.region import Region, region_points
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
-from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
-from halbach_fe.study.free_blocks_file import outline_of, validated_blocks, write_free_blocks
+from halbach_fe.study.free_blocks import (
+    COLUMNS,
+    REMANENCE_VECTOR,
+    FreeBlocks,
+    outline_of,
+    validated_blocks,
+    write_free_blocks,
+)
 from halbach_fe.study.model import Study
 from halbach_fe.study.study_file import (
     OUTER_RADIUS,

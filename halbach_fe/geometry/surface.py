@@ -208,7 +208,7 @@ def _contact(section: _Section, z_min: float, z_max: float, size: float, points:
     face = (side | end) & ~edge
     # distance, relative to the size of the body, at which the limit from outside is evaluated.
     # Closed forms of flat faces tell it from the face by 1e-12; the quadrature on arcs has parts of
-    # 1e-8 of the arc, see `halbach_fe.solver.prism_kernel`.
+    # 1e-8 of the arc, see `halbach_fe.solver.field_kernels`.
     beside_flat, beside_curved = 1e-11, 1e-8
     beside = size * np.where(side & section.curved, beside_curved, beside_flat)
     distance = np.where(side, section.distance, np.where(end, beyond, 0.0))

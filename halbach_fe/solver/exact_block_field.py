@@ -20,7 +20,7 @@ B_t remains.
 
 On straight edges the integrals are elementary; on arcs they are evaluated by Gauss-Legendre
 quadrature on panels that are no longer than their distance from the point, to an error of 1e-15 of
-the field. `halbach_fe.solver.prism_kernel` has them in compiled form.
+the field. `halbach_fe.solver.field_kernels` has them in compiled form.
 
 Fields of external sources (background, neighbouring magnets, objects, coils) are added in
 vacuum: the magnet's permeability and iron do not react to them, but for iron of any shape, see
@@ -42,8 +42,8 @@ from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, ring_radii
 from halbach_fe.solver.coil_field import coil_field
+from halbach_fe.solver.field_kernels import arc_table, cuboid_fields, outline_fields
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.solver.prism_kernel import arc_table, cuboid_fields, outline_fields
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 

@@ -47,6 +47,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     newton,
 )
 from halbach_fe.solver.dofs import Unknowns, check_difference, factorize
+from halbach_fe.solver.field_kernels import DEEPEST, NEAR, add_field, sweep
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
 from halbach_fe.solver.interpolation import (
     QUADRATURE,
@@ -60,7 +61,6 @@ from halbach_fe.solver.iron_modes import MESH, alone, assembled
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import RunSize, Session
-from halbach_fe.solver.tetrahedra import DEEPEST, NEAR, add_field, sweep
 
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element

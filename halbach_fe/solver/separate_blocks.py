@@ -40,13 +40,14 @@ from halbach_fe.solver.iron_bodies import (
 )
 from halbach_fe.solver.iron_modes import Resolution, check_bodies
 from halbach_fe.solver.moments.interaction import Interaction
-from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
 from halbach_fe.solver.moments.solve import (
+    KneeLaw,
     Moments,
     System,
     field_with_errors,
     reaction_columns,
     refinement,
+    solve_irreversible,
 )
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
@@ -107,7 +108,7 @@ class SeparateReaction:
             return np.zeros((len(points), 3))
         found, by_mean = (each.reaction(points) for each in self.blocks)
         # error bar of the field of irreversible losses, relative to the change that the law of the
-        # mean field in every cell makes (`halbach_fe.solver.moments.irreversible`). Where that
+        # mean field in every cell makes (`halbach_fe.solver.moments.solve`). Where that
         # module compares 3 and 4 cells a side with finer ones, the error was 0.08 to 0.24 of the
         # change in rings of cuboids, rms, and up to 0.3 near single cubes. The change with 2 cells,
         # which only signatures have, is no measure of their error.

@@ -189,7 +189,7 @@ class Demagnetization(StudyModel):
     coercivity, where the polarization is a tenth below the remanence (H_k of IEC 60404-8-1).
 
     With ``irreversible`` the blocks have lost for good what the field that they are in takes, and
-    the field of the magnet is that with the losses; see `halbach_fe.solver.moments.irreversible`.
+    the field of the magnet is that with the losses; see `halbach_fe.solver.moments.solve`.
     The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
     """
 

@@ -27,8 +27,7 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
-from halbach_fe.study.free_blocks import MAX_PATH
-from halbach_fe.study.free_blocks_file import free_blocks_of_file
+from halbach_fe.study.free_blocks import MAX_PATH, free_blocks_of_file
 from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
 from halbach_fe.study.model import Study, iron_of
 

@@ -29,8 +29,7 @@ from tomlkit.items import AoT, Array, InlineTable, Item, Table
 
 from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import write_text
-from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.free_blocks_file import free_blocks_of_file, write_free_blocks
+from halbach_fe.study.free_blocks import FreeBlocks, free_blocks_of_file, write_free_blocks
 from halbach_fe.study.inference import ExcludedReading
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, with_free_blocks

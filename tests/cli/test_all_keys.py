@@ -26,7 +26,7 @@ from halbach_fe.measurement.field_map import field_map, points_of, read_map, wri
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.array import Array
-from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks
+from halbach_fe.study.free_blocks import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import read_study
 from tests.conftest import changed
 from tests.support.pages import answer_of

@@ -25,7 +25,7 @@ def test_a_function_may_call_others_and_itself():
 
 def test_numba_is_imported_with_the_first_call():
     """To import it takes a second, which a command that computes no field can do without."""
-    code = ("import sys, numpy as np; from halbach_fe.solver.moments import near; "
-            "before = 'numba' in sys.modules; near.apart(np.ones(3), np.zeros(3)); "
+    code = ("import sys, numpy as np; from halbach_fe.solver.moments import kernels; "
+            "before = 'numba' in sys.modules; kernels.apart(np.ones(3), np.zeros(3)); "
             "sys.exit([before, 'numba' in sys.modules] != [False, True])")
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -15,8 +15,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import ring_catalogue
 from halbach_fe.design.ring_catalogue import Catalogue, largest_number
-from halbach_fe.design.ring_design import design_rings, task_of
-from halbach_fe.design.ring_search import Task, _best_pair, search
+from halbach_fe.design.ring_design import Task, _best_pair, design_rings, search, task_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.ring_design import STUDY_FILE, answer

@@ -57,8 +57,8 @@ from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session, newton_residuals
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
-from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.free_blocks_file import (
+from halbach_fe.study.free_blocks import (
+    FreeBlocks,
     free_blocks_of_file,
     read_free_blocks,
     write_free_blocks,

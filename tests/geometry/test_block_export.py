@@ -11,7 +11,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks
+from halbach_fe.study.free_blocks import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed
 from tests.geometry.test_free_blocks import SHAPES, row

@@ -15,8 +15,7 @@ from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
-from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.free_blocks_file import read_free_blocks
+from halbach_fe.study.free_blocks import FreeBlocks, read_free_blocks
 
 MU_0 = 4e-7 * np.pi
 MOMENT = np.array([[12.0, 0.1, -0.2], [-11.9, 0.3, 0.05]])

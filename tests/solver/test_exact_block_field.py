@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver import exact_block_field, prism_kernel
+from halbach_fe.solver import exact_block_field, field_kernels
 from halbach_fe.solver.exact_block_field import (
     FieldOfBlocks,
     field_of,
@@ -17,7 +17,7 @@ from halbach_fe.solver.exact_block_field import (
     unit_field,
     unit_fields,
 )
-from halbach_fe.solver.prism_kernel import arc_table
+from halbach_fe.solver.field_kernels import arc_table
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -102,7 +102,7 @@ def test_near_a_curved_face(short_dipole, generator):
     # negative control: arcs that are never halved are wrong there
     with pytest.MonkeyPatch.context() as patch:
         arc_table.cache_clear()
-        patch.setattr(prism_kernel, "ARC_LEVELS", 1)
+        patch.setattr(field_kernels, "ARC_LEVELS", 1)
         coarse = unit_field(block, points) @ source.polarization
         arc_table.cache_clear()
     assert np.abs(coarse - source.getB(points)).max() > 1e-2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.solver.exact_block_field import matrix_of
-from halbach_fe.solver.prism_kernel import arc_table, outline_fields, prism_field
+from halbach_fe.solver.field_kernels import arc_table, outline_fields, prism_field
 from tests.solver.moments.bodies import OUTLINES, block, cuboid_matrix
 
 ROUNDING = 1e-13

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import OutputError, StudyError
-from halbach_fe.study import free_blocks_file
-from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.free_blocks_file import (
+from halbach_fe.study import free_blocks
+from halbach_fe.study.free_blocks import (
+    FreeBlocks,
     free_blocks_of_file,
     read_free_blocks,
     write_free_blocks,
@@ -150,7 +150,7 @@ def test_files_that_are_none(blocks, tmp_path, monkeypatch):
         study.write_text(STUDY.replace('"blocks.csv"', wrong), encoding="utf-8")
         with pytest.raises(StudyError, match=r"array\.free_blocks"):
             read_study(study)
-    monkeypatch.setattr(free_blocks_file, "MAX_BYTES", 100)
+    monkeypatch.setattr(free_blocks, "MAX_BYTES", 100)
     blocks.rmdir()
     blocks.write_text(CSV, encoding="utf-8")
     with pytest.raises(StudyError, match="at most 1e\\+02 bytes"):

@@ -21,7 +21,7 @@ from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.solver.moments.irreversible import KneeLaw
+from halbach_fe.solver.moments.solve import KneeLaw
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.magnet import MOST_SQUARE, Demagnetization

@@ -44,8 +44,13 @@ from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.solver.exact_block_field import remanence_per_polarization
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
-from halbach_fe.study.free_blocks import REMANENCE_VECTOR, SIZES, FreeBlocks
-from halbach_fe.study.free_blocks_file import outline_of, validated_blocks
+from halbach_fe.study.free_blocks import (
+    REMANENCE_VECTOR,
+    SIZES,
+    FreeBlocks,
+    outline_of,
+    validated_blocks,
+)
 from halbach_fe.study.types import COMPONENTS
 
 TEXTS = ("serial", "type", "ring", "slot", "shape", "material")

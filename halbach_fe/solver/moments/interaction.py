@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.solver.exact_block_field import matrix_of
-from halbach_fe.solver.moments import near, tree
+from halbach_fe.solver.moments import kernels
 from halbach_fe.solver.moments.cells import Cells, gauss_nodes
 
 READING_DEGREE = 12
@@ -32,7 +32,7 @@ MOST_KEPT = 10_000_000
 
 @dataclass(frozen=True)
 class Clusters:
-    """A tree of clusters, see `halbach_fe.solver.moments.tree.build`."""
+    """A tree of clusters, see `halbach_fe.solver.moments.kernels.build`."""
 
     order: Ints
     limits: Ints
@@ -43,7 +43,7 @@ class Clusters:
     @classmethod
     def of(cls, places: Floats, sizes: Floats) -> Clusters:
         """Build the tree of items at places (n, 3) in m and with radii (n,) in m."""
-        return cls(*tree.build(np.ascontiguousarray(places), np.ascontiguousarray(sizes)))
+        return cls(*kernels.build(np.ascontiguousarray(places), np.ascontiguousarray(sizes)))
 
     def __len__(self) -> int:
         return len(self.limits)
@@ -109,7 +109,7 @@ class Interaction:
 
     def _pairs_with(self, targets: Clusters, opening: float) -> tuple[Neighbours, Neighbours]:
         own = self.clusters
-        far, close = tree.pairs(targets.children, targets.centres, targets.radii, own.children,
+        far, close = kernels.pairs(targets.children, targets.centres, targets.radii, own.children,
                                 own.centres, own.radii, opening)
         items = (targets.item(close[:, 0]), own.item(close[:, 1]))
         return (Neighbours.of(far[:, 0], far[:, 1], len(targets)),
@@ -119,7 +119,7 @@ class Interaction:
     def near_pairs(self) -> int:
         """Number of pairs of cells that are near to each other, which most of the memory is for."""
         own = self.clusters
-        _, close = tree.pairs(own.children, own.centres, own.radii, own.children, own.centres,
+        _, close = kernels.pairs(own.children, own.centres, own.radii, own.children, own.centres,
                               own.radii, self.opening)
         return len(close)
 
@@ -135,7 +135,7 @@ class Interaction:
         # distances of two cells, in units of the sum of their radii, below which they count as
         # touching or close
         touching, near_ratio = 1.0, 1.4
-        is_near = [near.touching(targets, sources, cells.centre, cells.radius, ratio)
+        is_near = [kernels.touching(targets, sources, cells.centre, cells.radius, ratio)
                    for ratio in (touching, touching + 1e-6, near_ratio)]
         quadrature = np.where(
             cells.block[targets] == cells.block[sources], np.where(is_near[1], 0, 3),
@@ -177,7 +177,7 @@ class Interaction:
             of_kinds[chosen] = self._means(targets[pairs], sources[pairs], nodes, is_graded)
         turned = self._in_frames(targets[first], of_kinds)
         found = np.empty((len(targets), 6))
-        in_threads(lambda first, last: near.turn_to_magnet(
+        in_threads(lambda first, last: kernels.turn_to_magnet(
             targets, kinds, first, last, self.cells.axes, turned, found), share_out(len(targets)))
         return found
 
@@ -193,7 +193,7 @@ class Interaction:
         some, place = np.unique(targets, return_inverse=True)
         local, weights = gauss_nodes(cells.vertices[some], cells.half[some], divisions, graded)
         nodes = cells.centre[some, None] + local @ np.swapaxes(cells.axes[some], 1, 2)
-        in_threads(lambda first, last: near.mean_matrices(
+        in_threads(lambda first, last: kernels.mean_matrices(
             place, sources, first, last, self.arrays, nodes, weights, found),
             share_out(len(targets)))
         return found
@@ -202,7 +202,7 @@ class Interaction:
         """Return the real and the imaginary parts of the moments of all clusters."""
         own = self.clusters
         moments = np.empty((len(own), (degree + 1) ** 2), complex)
-        tree.gather(own.order, own.limits, own.children, own.centres, self.cells.nodes, dipoles,
+        kernels.gather(own.order, own.limits, own.children, own.centres, self.cells.nodes, dipoles,
                     degree, moments)
         return moments.real.copy(), moments.imag.copy()
 
@@ -222,11 +222,11 @@ class Interaction:
         own = self.clusters
         moments = moments_of()
         expansions = np.empty((len(targets), (degree + 1) ** 2), complex)
-        in_threads(lambda first, last: tree.translate(
+        in_threads(lambda first, last: kernels.translate(
             far.starts, far.sources, first, last, targets.centres, own.centres, *moments, degree,
             expansions), far.shares(32))
-        tree.spread(targets.children, targets.centres, degree, expansions)
-        in_threads(lambda first, last: tree.scatter(
+        kernels.spread(targets.children, targets.centres, degree, expansions)
+        in_threads(lambda first, last: kernels.scatter(
             targets.order, targets.limits, targets.children, targets.centres, places, degree,
             expansions, first, last, found), share_out(len(targets)))
         return found
@@ -257,7 +257,7 @@ class Interaction:
     def _add_near_means(self, polarization: Floats, found: Floats) -> None:
         """Add the mean of mu_0 H (n, 3) in T of near cells over every cell."""
         close = self._pairs[1]
-        in_threads(lambda first, last: near.add_means(
+        in_threads(lambda first, last: kernels.add_means(
             close.starts, close.sources, self._matrices, polarization, first, last, found),
             close.shares(16))
 
@@ -268,7 +268,7 @@ class Interaction:
         """
         cells, close, dipoles = self.cells, self._pairs[1], self.dipoles(deviations)
         found = cells.mean(self._far(dipoles, degree))
-        in_threads(lambda first, last: near.add_of_deviations(
+        in_threads(lambda first, last: kernels.add_of_deviations(
             close.starts, close.sources, first, last, self.arrays, cells.nodes, dipoles,
             cells.volume, found), close.shares(32))
         return found
@@ -282,7 +282,7 @@ class Interaction:
     def _add_near_at_nodes(self, polarization: Floats, found: Floats) -> None:
         """Add mu_0 H (n, q, 3) in T of near cells at the nodes of every cell."""
         close = self._pairs[1]
-        in_threads(lambda first, last: near.add_at_nodes(
+        in_threads(lambda first, last: kernels.add_at_nodes(
             close.starts, close.sources, first, last, self.arrays, self.cells.nodes, polarization,
             found), close.shares(32))
 
@@ -300,7 +300,7 @@ class Interaction:
             inside = self._in_frames(
                 targets[first], self._node_matrices(targets[first], close.sources[first]))
             kept = np.empty((len(targets), cells.weights.shape[1], 3), np.float32)
-            in_threads(lambda first, last: near.rows_along(
+            in_threads(lambda first, last: kernels.rows_along(
                 targets, kinds, first, last, cells.axes, inside, along, kept),
                 share_out(len(targets)))
 
@@ -312,7 +312,7 @@ class Interaction:
                 self._add_near_at_nodes(polarization, at_nodes)
                 return np.einsum("nqi,ni->nq", at_nodes, along), mean
             component = np.einsum("nqi,ni->nq", at_nodes, along)
-            in_threads(lambda first, last: near.add_along(
+            in_threads(lambda first, last: kernels.add_along(
                 close.starts, close.sources, kept, polarization, first, last, component),
                 close.shares(16))
             return component, mean
@@ -324,7 +324,7 @@ class Interaction:
         cells = self.cells
         found = np.empty((3 * len(cells), 3 * (last - first)))
         nodes, weights = self._two_nodes
-        in_threads(lambda a, b: near.far_panel(
+        in_threads(lambda a, b: kernels.far_panel(
             a, b, first, nodes, weights, cells.volume, found),
             [(first + a, first + b) for a, b in share_out(last - first)])
         close = self._pairs[1]
@@ -343,7 +343,8 @@ class Interaction:
         """Return near pairs of cells, up to ``reach`` times the sum of their radii apart."""
         close = self._pairs[1]
         targets = close.targets
-        chosen = near.touching(targets, close.sources, self.cells.centre, self.cells.radius, reach)
+        chosen = kernels.touching(
+            targets, close.sources, self.cells.centre, self.cells.radius, reach)
         return Neighbours.of(targets[chosen], close.sources[chosen], len(self.cells))
 
     def node_matrices(self, targets: Ints, sources: Ints) -> Floats:
@@ -353,7 +354,7 @@ class Interaction:
     def _node_matrices(self, targets: Ints, sources: Ints) -> Floats:
         """Return the field matrices (n, q, 6) of source cells at the nodes of target cells."""
         found = np.empty((len(targets), self.cells.weights.shape[1], 6))
-        in_threads(lambda first, last: near.node_matrices(
+        in_threads(lambda first, last: kernels.node_matrices(
             targets, sources, first, last, self.arrays, self.cells.nodes, found),
             share_out(len(targets)))
         return found
@@ -376,7 +377,7 @@ class Interaction:
         cells = self.cells
         found = np.empty((len(points), 3, *cells.weights.shape, 3))
         weights = cells.weights * cells.volume[:, None]
-        in_threads(lambda first, last: near.readings_of_cells(
+        in_threads(lambda first, last: kernels.readings_of_cells(
             first, last, points, self._reach, cells.radius, self.arrays, cells.cuts,
             cells.of_parts, cells.nodes, weights, found), share_out(len(points)))
         return found
@@ -405,7 +406,7 @@ class Interaction:
             far, close = self._pairs_with(targets, 1 / self._reach)
             found = self._far_at(far, targets, points[:, None], moments,
                                  self.reading_degree)[:, 0]
-            in_threads(lambda first, last: near.add_of_parts(
+            in_threads(lambda first, last: kernels.add_of_parts(
                 close.starts, close.sources, first, last, self.arrays, self.cells.cuts, points,
                 of_parts, found), close.shares(32))
             return found

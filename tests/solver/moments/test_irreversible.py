@@ -11,8 +11,7 @@ from scipy.optimize import brentq, root
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.magnets import magnet_of_blocks
-from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
-from halbach_fe.solver.moments.solve import System
+from halbach_fe.solver.moments.solve import KneeLaw, System, solve_irreversible
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.grades import grade

@@ -8,7 +8,7 @@ import magpylib
 import numpy as np
 import pytest
 
-from halbach_fe.solver.moments import tree
+from halbach_fe.solver.moments import kernels
 from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.interaction import QUADRATURES, Interaction
 from tests.solver.moments.bodies import block, cuboid
@@ -38,8 +38,8 @@ def test_harmonics(generator):
     """1/|x - y| is the sum of conj(R(y)) I(x); its first missing term is (y/x)^13 of it."""
     x, y = np.array([1.0, -0.7, 0.4]), 0.2 * generator.normal(size=3)
     near, far = (np.empty(13**2, complex) for _ in range(2))
-    tree.regular(*y, 12, near)
-    tree.irregular(*x, 12, far)
+    kernels.regular(*y, 12, near)
+    kernels.irregular(*x, 12, far)
     assert np.sum(near.conj() * far).real == pytest.approx(
         1 / np.linalg.norm(x - y), rel=(np.linalg.norm(y) / np.linalg.norm(x)) ** 12)
 
