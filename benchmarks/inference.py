@@ -18,9 +18,15 @@ from halbach_fe.measurement.field_map import read_map
 from halbach_fe.response.nonlinear import nonlinear_model
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, independent_noise, nominal_prior
-from halbach_fe.stats.pcn import Posterior, Proposal, assess_convergence, prior_reference, sample
+from halbach_fe.stats.posteriors import (
+    Posterior,
+    Proposal,
+    assess_convergence,
+    prior_reference,
+    sample,
+)
 from halbach_fe.study.reader import read_study
 
 STUDIES = Path(__file__).parent.parent / "studies"
@@ -47,7 +53,7 @@ def posterior_time(note: Note) -> None:
         whitened = matrix / sigma[:, None]
         whitened.T @ whitened
         middle = time.monotonic()
-        linear_gaussian.update(matrix, readings, independent_noise(sigma), prior)
+        posteriors.update(matrix, readings, independent_noise(sigma), prior)
         times.append((middle - started, time.monotonic() - middle))
     product, all_ = np.min(times, axis=0)
     note("inference.posterior_time_over_gram", all_ / product, "ratio",

@@ -12,7 +12,7 @@ from halbach_fe.study.model import Study
 MODULES = (
     "study.reader", "study.model", "study.array", "study.free_blocks", "study.iron", "study.magnet",
     "study.measurement", "study.inference", "geometry.magnet", "stats.gaussian",
-    "stats.linear_gaussian", "stats.pcn", "solver.exact_block_field", "solver.ring_harmonics_2d",
+    "stats.posteriors", "solver.exact_block_field", "solver.ring_harmonics_2d",
     "measurement.field_map", "measurement.block_table", "measurement.campaign",
     "measurement.observation",
     "response.matrix", "inference.infer", "inference.result",

@@ -25,7 +25,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeshError, OutputError
 from halbach_fe.core.files import is_full
 from halbach_fe.geo.session import gmsh_session
-from halbach_fe.geometry.prism import Prism
+from halbach_fe.geometry.outline import Prism
 
 STEP_END = "END-ISO-10303-21;"
 """Last line of a STEP file."""

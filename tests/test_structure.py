@@ -162,7 +162,7 @@ def test_imports_point_one_way(me):
     ("solver.session", "subprocess"), ("inference.infer", "gmsh"),
     ("solver.mesh", "halbach_fe.report"), ("study.model", "halbach_fe.geometry.blocks"),
     ("solver.ring_harmonics_2d", "halbach_fe.study.model"),
-    ("stats.linear_gaussian", "halbach_fe.solver.getdp"),
+    ("stats.posteriors", "halbach_fe.solver.getdp"),
     ("inference.infer", "matplotlib.figure"), ("measurement.formats.opera", "halbach_fe.design"),
     ("synthetic.magpylib_field", "halbach_fe.solver.exact_block_field"),
     ("synthetic.bodies", "halbach_fe.geometry.blocks"), ("synthetic.bodies", "magpylib")])

@@ -19,8 +19,7 @@ from halbach_fe.geometry.array_layout import blocks_of_table, blocks_table
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import at_heights
-from halbach_fe.geometry.prism import Prism, upright
+from halbach_fe.geometry.outline import Prism, at_heights, upright
 from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable

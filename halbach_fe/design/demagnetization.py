@@ -43,7 +43,7 @@ from halbach_fe.study.grades import grade_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
-from halbach_fe.study.sentences import ABSOLUTE_ZERO_C
+from halbach_fe.study.types import ABSOLUTE_ZERO_C
 
 ACROSS = 6
 """Default number of cells across the radial thickness of a block, and least one along its other

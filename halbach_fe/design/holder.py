@@ -17,12 +17,14 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import (
     Outline,
+    Prism,
     circle,
     distance_from_origin,
     rectangle,
     thinnest_wall,
+    widened,
+    with_notch,
 )
-from halbach_fe.geometry.prism import Prism, widened, with_notch
 from halbach_fe.study.design import Holder, Rods
 
 SEGMENTS = {"0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd",

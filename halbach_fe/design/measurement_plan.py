@@ -47,7 +47,7 @@ from halbach_fe.response.region import Region, default_region, region_points
 from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import posterior
+from halbach_fe.stats.posteriors import posterior
 from halbach_fe.study.inference import Inference, InstrumentSd
 from halbach_fe.study.measurement import Instrument
 

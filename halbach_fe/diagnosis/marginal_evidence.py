@@ -24,7 +24,7 @@ import scipy.linalg as linalg
 from scipy import special
 
 from halbach_fe.core.arrays import Floats, Ints, slices
-from halbach_fe.stats.small_samples import false_discovery_rates
+from halbach_fe.stats.gaussian import false_discovery_rates
 
 
 @dataclass(frozen=True)

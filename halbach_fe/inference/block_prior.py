@@ -34,12 +34,13 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.measurement.block_table import REMANENT, BlockTable
 from halbach_fe.solver.exact_block_field import remanence_per_polarization
-from halbach_fe.stats.gaussian import Gaussian, remounted_root
-from halbach_fe.stats.small_samples import (
+from halbach_fe.stats.gaussian import (
+    Gaussian,
     anderson_darling,
     holm,
     measured_prior,
     predictive_covariance,
+    remounted_root,
 )
 
 DIRECTIONS = ("along", "across", "z")

@@ -64,9 +64,9 @@ from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, stacked_root, with_independent
-from halbach_fe.stats.linear_gaussian import Rows, predict
+from halbach_fe.stats.posteriors import Rows, predict
 from halbach_fe.study.inference import Uncertain
 from halbach_fe.study.model import Study
 
@@ -206,7 +206,7 @@ class _Update:
     """Noise of the readings, with the solver's error and the bend of |B|."""
     magnitudes: Magnitudes
     """About which readings of |B| are linear."""
-    update: linear_gaussian.LinearPosterior
+    update: posteriors.LinearPosterior
 
     @property
     def whole(self) -> Gaussian:
@@ -360,7 +360,7 @@ class _Search:
         residual, training = readings.values - model.offset, readings.training
         return _Update(
             readings, vectors, model, matrix, exact, of_field, prior, residual, errors, magnitudes,
-            linear_gaussian.update(matrix, residual[training], errors.subset(training), prior,
+            posteriors.update(matrix, residual[training], errors.subset(training), prior,
                                    np.flatnonzero(training)))
 
     def _prior_of_blocks(self, parameters: int) -> Gaussian:

@@ -50,7 +50,7 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import STEP
 from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, NoiseCovariance, root_matrix
-from halbach_fe.stats.linear_gaussian import Rows, predict
+from halbach_fe.stats.posteriors import Rows, predict
 from halbach_fe.study.inference import shifted
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

@@ -34,7 +34,7 @@ from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.pcn import (
+from halbach_fe.stats.posteriors import (
     Chain,
     ConvergenceDiagnostics,
     Posterior,

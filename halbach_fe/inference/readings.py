@@ -63,9 +63,9 @@ from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.response.matrix import Response, StoredMatrix
 from halbach_fe.solver.exact_block_field import external_field, field_of
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
-from halbach_fe.stats.linear_gaussian import Rows, row_slices
+from halbach_fe.stats.posteriors import Rows, row_slices
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, MIN_SIGMA_T
 
@@ -431,7 +431,7 @@ def overlaps(
     found = []
     for by in dict.fromkeys(by for _, by in near):
         rows = np.flatnonzero(training & (maps == by))
-        updated = linear_gaussian.update(
+        updated = posteriors.update(
             matrix, residual[rows], errors.subset(rows), prior, rows).distribution
         for (name, other), chosen in near.items():
             if other != by:
@@ -440,7 +440,7 @@ def overlaps(
             response = matrix[index]
             off = residual[index] - response @ updated.mean
             root = response @ updated.root
-            white = linear_gaussian.whitened(off, errors.subset(index), root.__getitem__,
+            white = posteriors.whitened(off, errors.subset(index), root.__getitem__,
                                              root.shape[1])
             found.append(Overlap(name, by, len(index), bool(held_out[index].all()),
                                  rms(off), float(np.mean(white**2))))
@@ -464,14 +464,14 @@ def left_out(
         if min(len(rows), len(index)) < ENOUGH:
             continue
         index = index[::-(-len(index) // most)]
-        updated = linear_gaussian.update(
+        updated = posteriors.update(
             matrix, residual[rows], errors.subset(rows), prior, rows).distribution
         response, noise = matrix[index], errors.subset(index)
         off, root = residual[index] - response @ updated.mean, response @ updated.root
-        white = linear_gaussian.whitened(off, noise, root.__getitem__, root.shape[1])
-        own = ~np.any([matrix[rows[each]].any(axis=0) for each in linear_gaussian.row_slices(
+        white = posteriors.whitened(off, noise, root.__getitem__, root.shape[1])
+        own = ~np.any([matrix[rows[each]].any(axis=0) for each in posteriors.row_slices(
             len(rows), response.shape[1])], axis=0)
-        fitted = linear_gaussian.update(response, residual[index], noise, updated).distribution
+        fitted = posteriors.update(response, residual[index], noise, updated).distribution
         off = off - response[:, own] @ (fitted.mean - updated.mean)[own]
         allowed = np.hypot(np.linalg.norm(np.where(own, 0.0, response) @ updated.root, axis=1),
                            noise.sd)

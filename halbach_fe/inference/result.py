@@ -45,7 +45,7 @@ from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
-from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
+from halbach_fe.stats.posteriors import contraction, row_slices, whitened
 from halbach_fe.study.inference import shifted
 from halbach_fe.study.model import Study
 
@@ -393,7 +393,7 @@ class InferenceResult(ShownInNotebook):
         Sentences about why the table of measured blocks may not be of this magnet.
     left_out : float
         Upper bound of the relative change of a posterior variance by discarded information, see
-        `halbach_fe.stats.linear_gaussian.LinearPosterior`.
+        `halbach_fe.stats.posteriors.LinearPosterior`.
     terms : InstrumentTerms or None
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
     amplitudes : Amplitudes or None
@@ -511,7 +511,7 @@ class InferenceResult(ShownInNotebook):
     @property
     def contraction(self) -> Floats:
         """Posterior contraction (blocks,) of the uniform magnetizations, see `contraction` of
-        `halbach_fe.stats.linear_gaussian`.
+        `halbach_fe.stats.posteriors`.
         """
         return contraction(self.by_block(self.prior.sd), self.by_block(self.posterior.sd))
 

@@ -19,8 +19,7 @@ from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import LEVEL_M, Plate
 from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_text
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import at_heights, circle
-from halbach_fe.geometry.prism import Prism, upright
+from halbach_fe.geometry.outline import Prism, at_heights, circle, upright
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     Page,

@@ -49,7 +49,7 @@ from halbach_fe.solver.routes import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Rows
-from halbach_fe.stats.linear_gaussian import row_slices
+from halbach_fe.stats.posteriors import row_slices
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import FIELD_KEYS
 

@@ -41,7 +41,7 @@ from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.routes import Route, check_points, choose_route, finite_element_part
 from halbach_fe.solver.session import RunSize, Session
-from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
+from halbach_fe.stats.posteriors import NUMBERS_AT_ONCE, READINGS_AT_ONCE
 from halbach_fe.study.model import CELLS_PER_SIDE
 from halbach_fe.study.types import COMPONENTS
 

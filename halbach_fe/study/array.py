@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import HalbachWarning
-from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.grades import (
     STRENGTHS,
@@ -30,6 +29,7 @@ from halbach_fe.study.types import (
     Remanence,
     Rotation,
     StudyModel,
+    reason,
 )
 
 
@@ -332,7 +332,7 @@ class Array(_OfGrade):
                 try:
                     self.of_ring(number)
                 except ValidationError as error:
-                    raise ValueError(f"ring {number}: {sentences.reason(error)}") from None
+                    raise ValueError(f"ring {number}: {reason(error)}") from None
         elif self.rings:
             self._check_strength()
             check_order(self.multipole_order, self.blocks_per_ring)

@@ -37,7 +37,6 @@ from halbach_fe.core.numbers import (
     parse_number,
 )
 from halbach_fe.core.untrusted import write_hdf5
-from halbach_fe.study import sentences
 from halbach_fe.study.grades import Material, columns_with_grades
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
@@ -49,7 +48,12 @@ from halbach_fe.study.types import (
     RecoilPermeability,
     Remanence,
     StudyModel,
+    contradiction,
     crossing,
+    did_you_mean,
+    expected,
+    received,
+    wrong_unit,
 )
 
 Shape = Literal["cuboid", "sector", "trapezoid", "cylinder", "polygon", "prism"]
@@ -564,7 +568,7 @@ def _check_columns(header: Sequence[str], where: str) -> None:
             difflib.get_close_matches(name[:100], COLUMNS, 1, 0.6))
         raise StudyError(must_be(
             f"column {number}", where, "a known column", f"'{name}'" if near else "another name",
-            sentences.did_you_mean(near[0], name) if near
+            did_you_mean(near[0], name) if near
             else f"Known columns: {', '.join(COLUMNS)}."))
 
 
@@ -654,7 +658,7 @@ def _outline_text(outline: Iterable[Iterable[float]] | None) -> str | None:
 def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) -> str:
     """Return one sentence about the first of pydantic's errors."""
     first = error.errors(include_url=False)[0]
-    given, ours = first.get("input"), sentences.contradiction(first)
+    given, ours = first.get("input"), contradiction(first)
     cause = first.get("ctx", {}).get("error")
     column, place = ([*first["loc"], None, None])[:2]
     what = "content" if column is None else f"`{column}`"
@@ -667,6 +671,6 @@ def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) ->
     if given is None:
         return must_be(what, where, "given", "nothing")
     if not isinstance(given, int | float):
-        return must_be(what, where, sentences.expected(first), sentences.received(given))
-    return must_be(what, where, sentences.expected(first), f"{given:g}",
-                   sentences.wrong_unit(str(column), given, first.get("ctx", {})))
+        return must_be(what, where, expected(first), received(given))
+    return must_be(what, where, expected(first), f"{given:g}",
+                   wrong_unit(str(column), given, first.get("ctx", {})))

@@ -19,7 +19,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.study import materials, sentences
+from halbach_fe.study import materials
 from halbach_fe.study.array import Array, common_material, remanence_sds
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
 from halbach_fe.study.grades import grade, grade_of
@@ -38,7 +38,16 @@ from halbach_fe.study.iron import Iron, IronCurve, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
-from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MIN_LENGTH_M, Length, Lines, StudyModel
+from halbach_fe.study.types import (
+    COMPONENTS,
+    MAX_LENGTH_M,
+    MIN_LENGTH_M,
+    Length,
+    Lines,
+    StudyModel,
+    reason,
+    sentence,
+)
 
 MAGNET_KEYS = {"dimension", "array", "iron_ring", "iron"}
 """Keys of a study that describe its magnet: blocks and iron."""
@@ -126,7 +135,7 @@ class _OfKeys(type(StudyModel)):  # type: ignore[misc]
         try:
             return super().__call__(**keys)
         except ValidationError as error:
-            raise StudyError(sentences.sentence(error, "study", cls)) from None
+            raise StudyError(sentence(error, "study", cls)) from None
 
 
 class Study(StudyModel, metaclass=_OfKeys):
@@ -258,7 +267,7 @@ class Study(StudyModel, metaclass=_OfKeys):
                 own = self.of_map(number)
             except ValidationError as error:
                 raise ValueError(f"map '{one.name}' does not fit the study: "
-                                 f"{sentences.reason(error)}") from None
+                                 f"{reason(error)}") from None
             for shared, name, tables, keys in (
                     ("probe", one.probe, ("instrument", "instrument_sd"), PROBE_KEYS),
                     ("stage", one.stage, ("instrument_sd",), POSE_KEYS)):

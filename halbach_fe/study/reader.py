@@ -26,10 +26,11 @@ from halbach_fe.core.errors import (
     printable,
 )
 from halbach_fe.core.files import as_path
-from halbach_fe.study import materials, sentences
+from halbach_fe.study import materials
 from halbach_fe.study.free_blocks import MAX_PATH, free_blocks_of_file
 from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
 from halbach_fe.study.model import Study, iron_of
+from halbach_fe.study.types import reason, sentence
 
 
 @typed
@@ -162,7 +163,7 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
     try:
         return Study.model_validate(document)
     except ValidationError as error:
-        raise StudyError(sentences.sentence(error, where, Study)) from None
+        raise StudyError(sentence(error, where, Study)) from None
 
 
 def with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
@@ -219,7 +220,7 @@ def _reading(path: Path, key: str, where: str, what: str) -> Iterator[Path]:
                                  f"{str(path)!r} ({error.strerror})",
                                  "Give its path from the study's folder.")) from None
     except ValueError as error:
-        wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
+        wrong = reason(error) if isinstance(error, ValidationError) else error
         raise StudyError(must_be(f"`{key}`", where, what,
                                  f"{str(path)!r}, which cannot be used: {wrong}")) from None
 

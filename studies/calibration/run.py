@@ -41,9 +41,9 @@ from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
 from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field
 from halbach_fe.solver.session import Session
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, independent_noise, nominal_prior
-from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
+from halbach_fe.stats.posteriors import Posterior, Proposal, laplace, prior_reference, sample
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
@@ -188,8 +188,8 @@ def linear_sampler(response: Response, noise: Noise, prior: Gaussian) -> Sampler
 
     def draw(readings: Floats, generator: np.random.Generator) -> Floats:
         residual = readings - response.offset
-        mean = linear_gaussian.posterior(matrix, residual, nominal, prior).mean
-        return linear_gaussian.posterior(matrix, residual, noise(mean), prior).sample(
+        mean = posteriors.posterior(matrix, residual, nominal, prior).mean
+        return posteriors.posterior(matrix, residual, noise(mean), prior).sample(
             DRAWS, generator)
 
     return draw

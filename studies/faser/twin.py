@@ -27,7 +27,7 @@ from halbach_fe.report.inference import page
 from halbach_fe.report.page import write_files
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import predict
+from halbach_fe.stats.posteriors import predict
 from halbach_fe.study.measurement import FluxDensity, PointPositions
 from halbach_fe.study.reader import read_study
 

@@ -63,13 +63,13 @@ def test_only_what_is_imported_counts(toy, changed, matters):
 def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
     names = {f"{path.parent.name}/{path.name}" for path in sources("halbach_fe.response.matrix")}
     assert {"geo/extruded.py", "pro/azimuthal_modes.pro", "pro/case.pro.j2",
-            "stats/linear_gaussian.py", "solver/exact_block_field.py"} <= names
+            "stats/posterior.py", "solver/exact_block_field.py"} <= names
     assert not any(name.startswith(("report/", "cli/", "diagnosis/")) for name in names)
 
 
 def test_chains_depend_on_the_sampler_too():
     names = {path.name for path in sources("halbach_fe.inference.mcmc")}
-    assert {"pcn.py", "nonlinear.py", "matrix.py", "magnetostatics_2d.pro"} <= names
+    assert {"posteriors.py", "nonlinear.py", "matrix.py", "magnetostatics_2d.pro"} <= names
 
 
 ORIGINS = {  # what pip wrote of the installation (PEP 610), and the command that adds an extra

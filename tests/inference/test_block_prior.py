@@ -39,7 +39,7 @@ from halbach_fe.solver.ring_harmonics_2d import (
     ideal_sectors,
     layered_bore_field,
 )
-from halbach_fe.stats.small_samples import (
+from halbach_fe.stats.gaussian import (
     anderson_darling,
     holm,
     predictive_covariance,

@@ -19,7 +19,7 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import matrix as response_module
 from halbach_fe.response.matrix import StoredMatrix, response_matrix
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import (
     CovarianceFactor,
     Gaussian,
@@ -27,7 +27,7 @@ from halbach_fe.stats.gaussian import (
     independent_noise,
     nominal_prior,
 )
-from halbach_fe.stats.linear_gaussian import update, whitened
+from halbach_fe.stats.posteriors import update, whitened
 from halbach_fe.study.reader import parse_study
 from tests.oracles.cuboids import cuboid_field, long_dipole
 from tests.support.pages import write_result
@@ -106,9 +106,9 @@ def test_in_parts_and_compressed(generator, monkeypatch, blocks):
     parameters without any loss, of many without those combinations of readings that say nothing.
     """
     case = problem(generator, 600, blocks)
-    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
-    monkeypatch.setattr(linear_gaussian, "NUMBERS_HELD", 100 * 3 * blocks)
-    monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", 0.0)  # by rows in any case
+    monkeypatch.setattr(posteriors, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(posteriors, "NUMBERS_HELD", 100 * 3 * blocks)
+    monkeypatch.setattr(posteriors, "WORST_CONDITION", 0.0)  # by rows in any case
     found = update(*case)
     assert (found.discarded_information > 0) == (blocks == 200)
     # what is left out bounds the change of variances; of the mean it is its root that does
@@ -118,7 +118,7 @@ def test_in_parts_and_compressed(generator, monkeypatch, blocks):
     assert isinstance(root, CovarianceFactor)
     assert root.directions.shape[1] <= min(600, 3 * blocks + 1)
     if blocks == 200:  # negative control: what says something must not be left out
-        monkeypatch.setattr(linear_gaussian, "NEGLIGIBLE", 0.5)
+        monkeypatch.setattr(posteriors, "NEGLIGIBLE", 0.5)
         coarse = update(*case)
         assert coarse.discarded_information > 0.1
         assert farthest(case, coarse) > 1e-2
@@ -129,7 +129,7 @@ def test_parts_that_cut_correlations_are_wrong(generator, monkeypatch):
     with that of the next part.
     """
     matrix, readings, noise, prior = problem(generator, 60, 30)
-    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(posteriors, "READINGS_AT_ONCE", 7)
     part = np.arange(60) // 7
     entries = noise.covariance.tocoo()
     rows, columns = entries.coords
@@ -148,7 +148,7 @@ def test_whitened_residuals_of_many_parameters(generator, monkeypatch):
     white = noise.whitening.toarray()
     values, vectors = np.linalg.eigh(white @ covariance @ white.T)
     expected = (vectors / np.sqrt(values)) @ vectors.T @ (white @ residual)
-    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(posteriors, "READINGS_AT_ONCE", 7)
     columns = root.shape[1]
     np.testing.assert_allclose(whitened(residual, noise, root.__getitem__, columns), expected,
                                atol=1e-9)
@@ -179,7 +179,7 @@ def peak(work):
 
 
 def test_memory_does_not_grow_with_readings_times_parameters(monkeypatch):
-    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 500)
+    monkeypatch.setattr(posteriors, "READINGS_AT_ONCE", 500)
     prior = Gaussian(np.zeros(120), np.eye(120))
 
     def used(count):
@@ -201,7 +201,7 @@ def test_a_matrix_on_the_disk(monkeypatch, session, tmp_path):
     observation = observe(study, points, np.ones_like(points, bool))
     whole = response_matrix(build_magnet(study), observation, session)
     monkeypatch.setattr(response_module, "LOADED_BYTES", 1000)
-    monkeypatch.setattr(linear_gaussian, "NUMBERS_AT_ONCE", 700)
+    monkeypatch.setattr(posteriors, "NUMBERS_AT_ONCE", 700)
     (session.folder / "response.h5").unlink()
     parts = response_matrix(build_magnet(study), observation, session)
     assert isinstance(parts.matrix, StoredMatrix)

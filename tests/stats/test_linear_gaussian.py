@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import (
     Gaussian,
     by_readings_alone,
@@ -15,7 +15,7 @@ from halbach_fe.stats.gaussian import (
     largest_directions,
     nominal_prior,
 )
-from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
+from halbach_fe.stats.posteriors import contraction, posterior, predict, update, whitened
 
 
 def textbook(matrix, readings, noise, prior):
@@ -228,7 +228,7 @@ def test_evidence_and_parameters_learnt(generator):
 def test_chunks_of_readings_add_up(generator, monkeypatch):
     case = problem(generator, 50, 5)
     whole = update(*case)
-    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(posteriors, "READINGS_AT_ONCE", 7)
     parts = update(*case)
     np.testing.assert_allclose(parts.distribution.mean, whole.distribution.mean, rtol=1e-10)
     assert parts.log_evidence == pytest.approx(whole.log_evidence, rel=1e-12)
@@ -240,7 +240,7 @@ def test_both_ways_agree(generator, monkeypatch):
     """The product, and where it would lose digits, rows."""
     case = problem(generator, 50, 5)
     one = update(*case)
-    monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", 0.0)
+    monkeypatch.setattr(posteriors, "WORST_CONDITION", 0.0)
     other = update(*case)
     np.testing.assert_allclose(other.distribution.covariance, one.distribution.covariance,
                                rtol=1e-9)
@@ -257,7 +257,7 @@ def test_rows_take_over_where_the_product_is_not_exact_enough(generator, monkeyp
     found = update(*case)
     np.testing.assert_allclose(found.distribution.mean, truth, atol=1e-5)
     assert 0 <= found.prior_conflict < 1  # no noise was added
-    monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", np.inf)  # negative control
+    monkeypatch.setattr(posteriors, "WORST_CONDITION", np.inf)  # negative control
     assert np.abs(update(*case).distribution.mean - truth).max() > 1e-5
 
 

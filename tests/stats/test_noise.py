@@ -11,8 +11,7 @@ from scipy import stats
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, independent_noise
-from halbach_fe.stats.linear_gaussian import update, whitened
-from halbach_fe.stats.pcn import Posterior, laplace
+from halbach_fe.stats.posteriors import Posterior, laplace, update, whitened
 
 
 def covariance_of(generator, sizes=(3, 1, 2, 3, 4)):

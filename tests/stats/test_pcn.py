@@ -7,8 +7,7 @@ import pytest
 
 from halbach_fe.core.errors import SamplingError
 from halbach_fe.stats.gaussian import Gaussian, independent_noise
-from halbach_fe.stats.linear_gaussian import update
-from halbach_fe.stats.pcn import (
+from halbach_fe.stats.posteriors import (
     ConvergenceDiagnostics,
     Posterior,
     Proposal,
@@ -17,6 +16,7 @@ from halbach_fe.stats.pcn import (
     prior_reference,
     require_convergence,
     sample,
+    update,
 )
 from studies.calibration.truth_ranks import ranks, uniformity
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import false_discovery_control
 
-from halbach_fe.stats.small_samples import false_discovery_rates
+from halbach_fe.stats.gaussian import false_discovery_rates
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])

@@ -10,7 +10,7 @@ import pytest
 from pydantic_core import ErrorType
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.study import sentences
+from halbach_fe.study import types
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed
@@ -60,8 +60,8 @@ def test_every_kind_of_error_has_a_sentence():
                   if key in node}
         patterns |= {node["pattern"]} if "pattern" in node else set()
     kinds.add("string_too_short")  # of texts that a validator of ours has seen before
-    assert kinds - {"string_pattern_mismatch"} == set(sentences.EXPECTED)
-    assert patterns == set(sentences.PATTERNS)
+    assert kinds - {"string_pattern_mismatch"} == set(types.EXPECTED)
+    assert patterns == set(types.PATTERNS)
     assert kinds <= set(get_args(ErrorType))
 
 

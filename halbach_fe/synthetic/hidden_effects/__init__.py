@@ -11,7 +11,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.study.sentences import wrong_unit
+from halbach_fe.study.types import wrong_unit
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
