@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from halbach_fe.core.arrays import Bools, Floats, box_middle, unit_circle
-from halbach_fe.geometry.blocks import MagnetBlock
+
+if TYPE_CHECKING:  # blocks stand on outlines
+    from halbach_fe.geometry.blocks import MagnetBlock
 
 
 @dataclass(frozen=True)
