@@ -17,10 +17,9 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.files import as_path
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.core.pace import Progress, Say, quiet
 from halbach_fe.core.result_folder import single_file

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arguments import check_options, typed
 from halbach_fe.core.arrays import rms
 from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.installation import import_extra
+from halbach_fe.core.interface import check_options, typed
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.array_layout import beside_blocks, blocks_table, free_outline

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
 from halbach_fe.geometry.array_layout import blocks_of_table, blocks_table
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words

@@ -21,7 +21,7 @@ import numpy as np
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -39,9 +39,8 @@ from halbach_fe.solver.magnetostatics import (
 from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.grades import grade_of
 from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MU_0, grade_of
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import ABSOLUTE_ZERO_C
 

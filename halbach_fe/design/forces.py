@@ -45,7 +45,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, rotation_matrix, vector
 from halbach_fe.geometry.magnet import Magnet
@@ -56,8 +56,7 @@ from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.iron_bodies import BodiesReaction
 from halbach_fe.solver.separate_blocks import SeparateReaction, applies, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
-from halbach_fe.study.grades import grade
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MU_0, grade
 
 SMALL = 0.1
 """Forces smaller than this share of the largest one have the error that it would have: symmetry

@@ -30,7 +30,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, box_middle
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.infer import neighbour_readings, seen_columns

@@ -38,7 +38,7 @@ from scipy.optimize import linprog
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.threads import compiled
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
@@ -59,7 +59,7 @@ from halbach_fe.response.region import Region, default_region, region_points
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
-from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import grade
 from halbach_fe.study.model import Study
 
 MISSES = 1e9

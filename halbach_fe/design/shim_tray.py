@@ -23,7 +23,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, slices, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
@@ -38,7 +38,7 @@ from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.design import ShimMagnet, ShimTray
 from halbach_fe.study.free_blocks import COLUMNS
-from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import grade
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

@@ -31,7 +31,7 @@ import scipy.linalg as linalg
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Known, Objective
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.design.sorting import Slots

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg as linalg
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.marginal_evidence import (

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import (
     MagnetBlock,

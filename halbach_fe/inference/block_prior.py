@@ -24,10 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import poisson
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet

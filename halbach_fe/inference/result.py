@@ -19,7 +19,7 @@ from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.core.errors import StudyError
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import decimals, in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
+from halbach_fe.core.interface import typed
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
     TOTAL_SIGMA_COLUMN,

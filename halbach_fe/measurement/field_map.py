@@ -33,7 +33,6 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from halbach_fe.core import untrusted
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, plain
 from halbach_fe.core.errors import (
     HalbachError,
@@ -43,6 +42,7 @@ from halbach_fe.core.errors import (
     must_be,
 )
 from halbach_fe.core.files import as_path, atomic, file_bytes
+from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import decimals
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.core.untrusted import hdf5_bytes

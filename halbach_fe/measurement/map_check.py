@@ -24,9 +24,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.doubted_terms import doubted_from

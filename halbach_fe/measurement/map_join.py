@@ -23,10 +23,10 @@ from scipy.optimize import least_squares
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
+from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.campaign import refuse_shared

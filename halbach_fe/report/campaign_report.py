@@ -14,9 +14,9 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from urllib.parse import quote
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import MAX_QUOTED, MAX_SENTENCE, OutputError, must_be, printable
 from halbach_fe.core.files import as_path, write_text
+from halbach_fe.core.interface import typed
 from halbach_fe.core.result_folder import result_folder, single_file
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from

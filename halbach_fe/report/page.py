@@ -32,11 +32,11 @@ from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
 
 import halbach_fe
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, box_middle, degrees_of, radii_of
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.core.installation import version
+from halbach_fe.core.interface import typed
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet

@@ -12,7 +12,7 @@ from math import ceil
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, of_length
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.pace import Say, quiet
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet

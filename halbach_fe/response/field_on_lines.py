@@ -28,7 +28,7 @@ from scipy.integrate import cumulative_simpson, simpson
 
 from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.iron import IronSolid

@@ -259,7 +259,7 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
     These are the point that needs the most azimuthal modes, and the points farthest from the axis
     and from the plane z = 0. If azimuthal modes apply, there is also a point at every place (r, z)
     of the half-plane, up to the number of rings: whether there are fewer places than rings decides
-    what is solved for, see `halbach_fe.solver.reciprocal_columns`.
+    what is solved for, see `halbach_fe.solver.iron_modes`.
     """
     decisive = [
         np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,

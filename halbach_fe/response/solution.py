@@ -11,7 +11,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.installation import version
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import field_map, write_map

@@ -26,6 +26,7 @@ from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
 from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.iron_modes import reciprocal_gradients, saves_solves
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
@@ -37,7 +38,6 @@ from halbach_fe.solver.magnetostatics import (
     solve_tangent,
 )
 from halbach_fe.solver.mesh import meridian_size
-from halbach_fe.solver.reciprocal_columns import reciprocal_gradients, saves_solves
 from halbach_fe.solver.separate_blocks import (
     applies,
     external_acts,

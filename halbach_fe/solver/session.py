@@ -22,7 +22,6 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, NotConvergedError, OutputError
 from halbach_fe.core.files import (
@@ -32,6 +31,7 @@ from halbach_fe.core.files import (
     remove_orphans,
     temporary_path,
 )
+from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import is_run_folder, locked_folder

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.grades import (
+from halbach_fe.study.materials import (
     STRENGTHS,
     Material,
     doubted_strength,

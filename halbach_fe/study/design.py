@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from halbach_fe.study.array import BlocksPerRing
-from halbach_fe.study.grades import Material
+from halbach_fe.study.materials import Material
 from halbach_fe.study.types import (
     Angle,
     Gap,

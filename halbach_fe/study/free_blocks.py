@@ -37,7 +37,7 @@ from halbach_fe.core.numbers import (
     parse_number,
 )
 from halbach_fe.core.untrusted import write_hdf5
-from halbach_fe.study.grades import Material, columns_with_grades
+from halbach_fe.study.materials import Material, columns_with_grades
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
     MIN_LENGTH_M,

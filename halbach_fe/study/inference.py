@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from halbach_fe.study.grades import Material
+from halbach_fe.study.materials import Material
 from halbach_fe.study.measurement import Instrument, NoiseSettings, Positions
 from halbach_fe.study.types import (
     COMPONENTS,

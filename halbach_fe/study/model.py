@@ -22,7 +22,6 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
 from halbach_fe.study.array import Array, common_material, remanence_sds
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
-from halbach_fe.study.grades import grade, grade_of
 from halbach_fe.study.inference import (
     POSE_KEYS,
     PROBE_KEYS,
@@ -36,7 +35,7 @@ from halbach_fe.study.inference import (
 )
 from halbach_fe.study.iron import Iron, IronCurve, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
-from halbach_fe.study.materials import Curve
+from halbach_fe.study.materials import Curve, grade, grade_of
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.types import (
     COMPONENTS,

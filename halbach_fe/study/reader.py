@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import (
     MAX_QUOTED,
     HalbachWarning,
@@ -26,6 +25,7 @@ from halbach_fe.core.errors import (
     printable,
 )
 from halbach_fe.core.files import as_path
+from halbach_fe.core.interface import typed
 from halbach_fe.study import materials
 from halbach_fe.study.free_blocks import MAX_PATH, free_blocks_of_file
 from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, spread
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import write_text
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map

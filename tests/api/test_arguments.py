@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import halbach_fe as hf
-from halbach_fe.core.arguments import typed
+from halbach_fe.core.interface import typed
 
 FUNCTIONS = [name for name in hf.__all__ if not inspect.isclass(getattr(hf, name))]
 WRONG = (object(), 1j, b"bytes", int, iter(["gain_x"]))

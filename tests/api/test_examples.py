@@ -16,7 +16,7 @@ import pytest
 import tomlkit
 
 import halbach_fe as hf
-from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.interface import ShownInNotebook
 from tests.conftest import DIPOLE, changed
 from tests.support import cuboids
 

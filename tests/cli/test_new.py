@@ -16,7 +16,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.study_file import MagnetTemplate, new_study, parse_new_study
 from tests.cli.test_cli import refused

@@ -15,7 +15,7 @@ from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
-from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import draw_magnet

@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.study.free_blocks import COLUMNS, SIZES
-from halbach_fe.study.grades import grades
+from halbach_fe.study.materials import grades
 from tests.conftest import ROOT, module_of
 
 gallery = module_of("gallery", ROOT / "docs" / "gallery.py")

@@ -45,8 +45,7 @@ from halbach_fe.stats.gaussian import (
     predictive_covariance,
     shrunk_covariance,
 )
-from halbach_fe.study.grades import grade
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MU_0, grade
 from halbach_fe.synthetic import bodies
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from tests.oracles.cuboids import aharoni

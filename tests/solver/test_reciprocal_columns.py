@@ -13,10 +13,10 @@ from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.resource_estimate import decisive_points
-from halbach_fe.solver import reciprocal_columns, routes
+from halbach_fe.solver import iron_modes, routes
 from halbach_fe.solver.azimuthal_modes import meridian_points, solve_modes
 from halbach_fe.solver.getdp_cache import Cache
-from halbach_fe.solver.reciprocal_columns import angle_integrals, reciprocal_gradients, saves_solves
+from halbach_fe.solver.iron_modes import angle_integrals, reciprocal_gradients, saves_solves
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.conftest import changed, circle
@@ -66,7 +66,7 @@ def test_the_response_takes_them(magnet_of, session, monkeypatch, tmp_path):
     points = POINTS[:16] * [0.3, 0.3, 1]  # near the axis few modes matter
     observation = observe(magnet.study, points, np.ones((len(points), 3), bool))
     forward = response_matrix(magnet, observation, session.within("forward"))
-    monkeypatch.setattr(reciprocal_columns, "SAVED_SOLVES", -1000)
+    monkeypatch.setattr(iron_modes, "SAVED_SOLVES", -1000)
     taken = []
 
     def gradients(case, session, shift=0):
@@ -108,13 +108,13 @@ def test_an_estimate_takes_the_same_way(magnet_of):
 
 def test_a_matrix_of_other_materials_is_refused(magnet_of, session, monkeypatch):
     """Negative control of the comparison with GetDP's matrix: elements without their iron."""
-    materials = reciprocal_columns._materials
+    materials = iron_modes._materials
 
     def without_iron(case):
         ring, permeability = materials(case)
         return ring, np.minimum(permeability, 2.0)
 
-    monkeypatch.setattr(reciprocal_columns, "_materials", without_iron)
+    monkeypatch.setattr(iron_modes, "_materials", without_iron)
     with pytest.raises(GetDPError, match="matrix differs"):
         solve_modes(magnet_of(iron_ring=IRON), POINTS, [0], session, 1, reciprocal_gradients)
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.study.free_blocks import COLUMNS, SIZES, FreeBlocks, RowError
-from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import parse_study
 from halbach_fe.study.types import crossing
 from tests.conftest import DIPOLE, changed

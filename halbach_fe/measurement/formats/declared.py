@@ -9,9 +9,9 @@ from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from halbach_fe.core.arguments import check_options
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import as_path
+from halbach_fe.core.interface import check_options
 from halbach_fe.measurement.formats.units import ANGLES, KINDS, kind_of, unit_symbol
 
 FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim", "srw", "fluka",

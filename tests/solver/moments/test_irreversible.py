@@ -14,9 +14,8 @@ from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.solver.moments.solve import KneeLaw, System, solve_irreversible
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import Session
-from halbach_fe.study.grades import grade
 from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MU_0, grade
 from halbach_fe.study.reader import parse_study
 from tests.solver.moments.bodies import cuboid
 
