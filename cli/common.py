@@ -351,8 +351,8 @@ def session(
     The folder becomes that of this verb and ``study``; shipped studies own theirs already.
     """
     from halbach_fe.report.answer import inputs_of_command, known_inputs
-    from halbach_fe.solver.dask_cluster import connected
     from halbach_fe.solver.getdp import getdp_or_none
+    from halbach_fe.solver.session import connected
 
     getdp = getdp_or_none(arguments.getdp)
     if study is not None:
@@ -380,7 +380,7 @@ def cache(arguments: argparse.Namespace) -> Cache | None:
 def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
     """Open an executor: processes of this machine, or the workers of --scheduler."""
     if arguments.scheduler is not None:
-        from halbach_fe.solver.dask_cluster import connected
+        from halbach_fe.solver.session import connected
 
         with connected(arguments.scheduler, say) as cluster:
             yield cluster.executor

@@ -51,8 +51,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, rotation_mat
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.solver.axisymmetric_iron import IronReaction
-from halbach_fe.solver.coil_field import current_elements
-from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.exact_block_field import current_elements, external_field, field_of
 from halbach_fe.solver.iron_bodies import BodiesReaction
 from halbach_fe.solver.separate_blocks import SeparateReaction, applies, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone

@@ -167,7 +167,7 @@ class Job:
 Run = Callable[
     [GetDP, Job, Path, Callable[[str], None] | None, threading.Event | None], list[str]]
 """A function with the arguments and results of `run`, such as
-`halbach_fe.solver.dask_cluster.Cluster.run`."""
+`halbach_fe.solver.session.Cluster.run`."""
 
 
 NO_GETDP = GetDP(Path(), "none", (), "")

@@ -22,9 +22,9 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import ExtraMissingError, GetDPError, SchedulerError
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.dask_cluster import Cluster, connected
 from halbach_fe.solver.getdp import ENVIRONMENT_VARIABLE
 from halbach_fe.solver.routes import solve_nominal
+from halbach_fe.solver.session import Cluster, connected
 from tests.conftest import ROOT, circle
 
 POINTS = circle(0.07, 8)
@@ -278,7 +278,7 @@ def test_a_client_that_has_given_up(dipole, session):
 
 @pytest.mark.parametrize("address", ["", "tcp://127.0.0.1:1", "nonsense", "tcp://127.0.0.1:no"])
 def test_nobody_there(address, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("halbach_fe.solver.dask_cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("halbach_fe.solver.session.CONNECT_S", 1.0)
     assert main(["solve", str(QUADRUPOLE / "study.toml"), "-o", str(tmp_path / "out"),
                  "--scheduler", address]) == 12
     assert "must be the address of a running Dask scheduler" in capsys.readouterr().err

@@ -12,8 +12,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added, one_and
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.coil_field import coil_field
-from halbach_fe.solver.exact_block_field import dipole_field, neighbour_field
+from halbach_fe.solver.exact_block_field import coil_field, dipole_field, neighbour_field
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.separate_blocks import external_acts
 from halbach_fe.study.iron import FroehlichKennellyCurve, IronRing, SteelCurve
