@@ -21,7 +21,7 @@ from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import Line, is_comment, lines_of, uncommented
+from halbach_fe.measurement.tables import Line, is_comment, lines_of, uncommented
 from halbach_fe.study.types import COMPONENTS
 
 PER_M = 100.0

@@ -29,7 +29,8 @@ from halbach_fe.measurement.formats import names
 from halbach_fe.measurement.formats.conversion import ForeignTable, with_units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
+from halbach_fe.measurement.tables import (
     RUN_TOGETHER,
     Line,
     cells_of,
@@ -44,7 +45,6 @@ from halbach_fe.measurement.formats.text import (
     uncommented,
     undecorated,
 )
-from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
 MARKED = re.compile(r"(?i)^(variables\s*=|[;*$]\s)\s*|\s\*$")
 """What stands before a header: of Tecplot, of MAD-X, and of comments in other programs."""

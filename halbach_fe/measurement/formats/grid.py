@@ -37,15 +37,15 @@ from halbach_fe.measurement.field_map import points_of, refuse_total_field
 from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import CARTESIAN, in_units
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.tables import (
     Line,
     comments_of,
     delimiter_of,
+    finite,
     is_comment,
     lines_of,
     rows_of,
 )
-from halbach_fe.measurement.tables import finite
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3

@@ -32,7 +32,7 @@ from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
+from halbach_fe.measurement.tables import Line, lines_of, rows_of
 from halbach_fe.study.materials import MU_0
 
 COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
