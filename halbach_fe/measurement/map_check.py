@@ -143,8 +143,8 @@ ALIKE = 30.0
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
 
 WORTH_TRYING = 3.0
-"""Orientations are tried with an instrument of their own if their rms residuals without one differ
-by less than this factor."""
+"""Orientations are tried with an instrument of their own, and poses in a magnet improved, if their
+rms residuals without that differ by less than this factor."""
 
 ALMOST_ALIKE = float(np.log(20.0))
 """Log odds within which one parameter may as well be another, as for causes in the diagnosis."""

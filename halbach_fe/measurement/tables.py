@@ -259,6 +259,8 @@ RUN_TOGETHER = re.compile(r"(\.\d+(?:[eEdD][-+]\d+)?)(?=[-+]\d*\.\d)")
 IN_LISTS = frozenset("0123456789+-.,;eE*^|[]{}() \t")
 """Characters of rows of numbers in the brackets of lists or between bars."""
 COMPLEX = re.compile(r"[-+]?[\d.]+([eE][-+]?\d+)?[-+][\d.]+([eE][-+]?\d+)?\s*\*?[ij]")
+MAX_LINE = 200
+"""Number of characters of a line of a header that are searched."""
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
 
