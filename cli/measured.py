@@ -98,7 +98,6 @@ def check(arguments: argparse.Namespace) -> int:
     each map.
     """
     from halbach_fe.measurement.field_map import is_total_field
-    from halbach_fe.report import map_check
 
     files = [arguments.map, *arguments.others]
     if arguments.turn_rad and not arguments.others:
@@ -116,20 +115,21 @@ def check(arguments: argparse.Namespace) -> int:
                               "this one would remove. Name another folder, or remove this one.")
         common.own_folder(arguments)
     say = quiet if arguments.json else common.say
+    found: object
     with common.progress_bar("checking") as show:
         if arguments.others:
             from halbach_fe.measurement.joined_probe import TURN_RAD
 
-            named = dict(zip(arguments.listed_maps, maps, strict=True))
-            page = map_check.joined_page(named, hf.join_maps(
-                named, say, show, arguments.turn_rad or TURN_RAD))
+            found = hf.join_maps(dict(zip(arguments.listed_maps, maps, strict=True)), say, show,
+                                 arguments.turn_rad or TURN_RAD)
         elif is_total_field(maps[0]):
             from halbach_fe.measurement.suspect_rows import check_total
+            from halbach_fe.report.map_check import total_page
 
-            page = map_check.total_page(maps[0], check_total(maps[0]))
+            found = total_page(maps[0], check_total(maps[0]))
         else:
-            page = map_check.page(maps[0], hf.check_map(maps[0], say, show))
-    return common.finish(arguments, page)
+            found = hf.check_map(maps[0], say, show)
+    return common.finish(arguments, found)
 
 
 def _by_name(files: list[InputFile]) -> dict[str, InputFile]:

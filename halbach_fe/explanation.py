@@ -174,9 +174,9 @@ class _InMemory:
         said = answer_of_check(self.checked, are_in_order(self.data))
         self._answered("check", said)
         if "corrected_map" in said.command:
-            self.data = corrected(self.data, self.checked)
+            self.data = corrected(self.checked)
         elif self.checked.is_reoriented or self.checked.excluded.any():
-            self.data = oriented(self.data, self.checked)
+            self.data = oriented(self.checked)
 
     def infer(self, name: str) -> bool:
         self.result = infer(self.magnet, self.data, self.session.within(name), self.blocks,

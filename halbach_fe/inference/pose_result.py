@@ -13,6 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.doubted_terms import Term
+from halbach_fe.measurement.map_check import DETERMINED
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
@@ -21,10 +22,6 @@ from halbach_fe.study.model import Study
 DEGREES = ("shift along x", "shift along y", "shift along z",
            "turn about x", "turn about y", "turn about z")
 """Degrees of freedom of a pose, along and about the axes of the magnet."""
-
-UNDETERMINED = 0.5
-"""Standard deviation, in units of the prior's, from which the map does not determine a degree of
-freedom."""
 
 EXPLAINED = 3.0
 """Chi-squared per reading up to which the updated magnet explains a map. Unlike a wrong magnet,
@@ -62,7 +59,7 @@ class ProbePrior:
         total : bool
             Whether the map is of |B|, whose probe has neither axes nor several sensors.
         """
-        sd = np.where(pose_sd < UNDETERMINED * pose_prior_sd, pose_sd, 0.0).reshape(2, 3)
+        sd = np.where(pose_sd < DETERMINED * pose_prior_sd, pose_sd, 0.0).reshape(2, 3)
         shift, turn = np.clip(WIDER * sd.max(axis=1), NARROWEST_POSE, WIDEST_POSE).tolist()
         most_m, most = WIDEST_POSE.tolist()  # of every key of `InstrumentSd`
         return known.with_(
@@ -282,7 +279,7 @@ class Registration:
         """Shifts and turns that the map does not determine, which the prior holds."""
         sd = np.concatenate([self.translation_sd_m, self.rotation_sd_rad])
         return tuple(name for name, one, prior in zip(DEGREES, sd, self.prior_sd, strict=True)
-                     if one > UNDETERMINED * prior)
+                     if one > DETERMINED * prior)
 
     @property
     def explains(self) -> bool:

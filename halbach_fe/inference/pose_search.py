@@ -25,6 +25,8 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import UNDIRECTED_COLUMN
+from halbach_fe.measurement.instrument import DIFFERENCE_M
+from halbach_fe.measurement.map_check import WORTH_TRYING
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
 SAME_M, SAME_RAD = 1e-3, 0.02
@@ -100,9 +102,8 @@ COARSE_POINTS, MIDDLE_POINTS = 60, 150
 STEP = 0.4
 """Step of the translations along the axis, in units of the bore's radius."""
 
-CANDIDATES, WORTH_TRYING = 2, 3.0
-"""Largest number of candidates of every rotation that are improved, and multiple of the smallest
-rms residual up to which they are."""
+CANDIDATES = 2
+"""Largest number of candidates of every rotation that are improved."""
 
 UNEXPLAINED = 0.5
 """Share of the field, in rms, that the nominal blocks may leave in the best pose."""
@@ -121,9 +122,6 @@ NARROW = 0.02
 
 ITERATIONS = 12
 """Largest number of steps of the improvement of a candidate."""
-
-DIFFERENCE_M = 2e-4
-"""Step of finite differences."""
 
 
 def coarse_poses(

@@ -29,6 +29,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.inference.result import (
     ALL_READINGS,
+    FEWEST_READINGS,
     HELD_OUT,
     HELD_OUT_MAP,
     TRAINING,
@@ -393,9 +394,6 @@ overlap: half the diagonal of a cell of its grid."""
 END = 0.15
 """Part of the length of a single map that is left out at each end."""
 
-ENOUGH = 20
-"""Fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third."""
-
 STRETCHES = 7
 """Number of parts of a map that was left out, along its longest axis, that are told apart."""
 
@@ -461,7 +459,7 @@ def left_out(
     most = 4000
     for name, chosen in _regions(readings).items():
         rows, index = np.flatnonzero(readings.training & ~chosen), np.flatnonzero(chosen)
-        if min(len(rows), len(index)) < ENOUGH:
+        if min(len(rows), len(index)) < FEWEST_READINGS:
             continue
         index = index[::-(-len(index) // most)]
         updated = posteriors.update(
@@ -491,7 +489,7 @@ def _stretches(places: Floats, off: Floats, noise: Floats) -> tuple[Stretch, ...
         Stretch(COMPONENTS[axis], float(along[rows].min()), float(along[rows].max()), len(rows),
                 rms(off[rows]), rms(noise[rows]))
         for rows in (np.flatnonzero(owner == number) for number in range(STRETCHES))
-        if len(rows) >= ENOUGH)
+        if len(rows) >= FEWEST_READINGS)
 
 
 def _regions(readings: Readings) -> dict[str, NDArray[np.bool_]]:

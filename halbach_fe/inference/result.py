@@ -73,7 +73,8 @@ three. Error bars of the solver that count as noise leave 0.2 in magnets that ar
 
 FEWEST_READINGS = 20
 """Readings, beyond the parameters learnt, whose chi-squared is below that by chance with a
-probability of 1e-7. Of fewer it has to be smaller: of one, it is so in a quarter of all maps."""
+probability of 1e-7, with a sd of a third. Of fewer it has to be smaller: of one, it is so in a
+quarter of all maps."""
 
 OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run `halbach-fe check` "
              "for the noise of the map.")

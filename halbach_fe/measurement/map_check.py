@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.core.interface import typed
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.doubted_terms import doubted_from
@@ -143,8 +143,8 @@ ALIKE = 30.0
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
 
 WORTH_TRYING = 3.0
-"""Orientations are tried with an instrument of their own if their rms residuals without one differ
-by less than this factor."""
+"""Orientations are tried with an instrument of their own, and poses in a magnet improved, if their
+rms residuals without that differ by less than this factor."""
 
 ALMOST_ALIKE = float(np.log(20.0))
 """Log odds within which one parameter may as well be another, as for causes in the diagnosis."""
@@ -260,11 +260,13 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class MapCheck:
+class MapCheck(ShownInNotebook):
     """What a map shows by itself.
 
     Attributes
     ----------
+    data : Dataset
+        The map.
     readings, points : int
         Number of components that were measured, and of positions.
     spacing_m : float
@@ -317,6 +319,7 @@ class MapCheck:
         or ``none``, if the map has no times and no stage goes from row to row.
     """
 
+    data: xr.Dataset
     readings: int
     points: int
     spacing_m: float
@@ -421,7 +424,7 @@ class MapCheck:
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
-        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T", "gap_m")
+        left_out = ("data", "excluded", "residual_T", "unseen_T", "corrected_T", "gap_m")
         plain = {name: value.tolist() if isinstance(value, np.ndarray) else value
                  for name, value in self.__dict__.items()
                  if name not in left_out and name not in ("terms", "reach")}
@@ -476,7 +479,7 @@ def check_map(
     >>> hf.check_map(field_map(points, field)).suffices
     True
     """
-    data = _checkable(data)
+    given, data = data, _checkable(data)
     pace = Pace(say, progress)
     _begin(pace, 1, "looking for rows that are no readings")
     scan, usable, broken = scan_of(data, pace)
@@ -494,7 +497,7 @@ def check_map(
     _begin(pace, 5, "fitting all scan lines")
     whole, fitted, rows = _without_spikes(fitted, rows, broken)
     return MapCheck(
-        readings=int(np.isfinite(scan.field).sum()), points=len(usable),
+        data=given, readings=int(np.isfinite(scan.field).sum()), points=len(usable),
         spacing_m=point_spacing(scan.points[rows.chosen]),
         size_T=float(np.linalg.norm(fitted.model.field[rows.usable], axis=1).max()),
         order=_order(data),
@@ -504,9 +507,9 @@ def check_map(
         **_remaining(fitted, whole, scan, matrix, rows))
 
 
-def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
+def oriented(check: MapCheck) -> xr.Dataset:
     """Return the map without broken rows, with its columns along the axes that they belong to."""
-    kept = data.isel(point=np.flatnonzero(~check.excluded))
+    kept = check.data.isel(point=np.flatnonzero(~check.excluded))
     turned = kept.copy(deep=True)
     for column, name in enumerate(check.orientation):
         axis, sign = COMPONENTS.index(name[-1]), -1.0 if name.startswith("-") else 1.0
@@ -516,12 +519,12 @@ def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
     return turned
 
 
-def inner(data: xr.Dataset, check: MapCheck) -> xr.Dataset | None:
+def inner(check: MapCheck) -> xr.Dataset | None:
     """Return the oriented map in the region that a field without sources describes, if not all."""
     if check.reach is None or not np.isfinite(check.reach.limit_m):
         return None
-    return oriented(data, check).isel(point=np.flatnonzero(
-        check.reach.holds(points_of(data))[~check.excluded]))
+    return oriented(check).isel(point=np.flatnonzero(
+        check.reach.holds(points_of(check.data))[~check.excluded]))
 
 
 def _remaining(

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
-from halbach_fe.core.interface import typed
+from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.campaign import refuse_shared
@@ -243,7 +243,7 @@ def read_joined(path: Path) -> tuple[str, tuple[MapPose, ...]]:
 
 
 @dataclass(frozen=True)
-class JoinedMaps:
+class JoinedMaps(ShownInNotebook):
     """Maps of one magnet in the frame of the first one.
 
     Attributes
@@ -311,14 +311,14 @@ class Checked:
     """Shape (k,)."""
 
     @classmethod
-    def of(cls, name: str, data: xr.Dataset, check: MapCheck) -> Checked:
+    def of(cls, name: str, check: MapCheck) -> Checked:
         """Take the part of a map that obeys Maxwell's equations."""
         rows = ~check.excluded
-        floor, within = check.floor_rms_T, inner(data, check)
+        floor, within = check.floor_rms_T, inner(check)
         if within is not None and check.reach is not None:
-            rows = rows & check.reach.holds(points_of(data))
+            rows = rows & check.reach.holds(points_of(check.data))
             floor = check.reach.inside_T
-        kept = oriented(data, check) if within is None else within
+        kept = oriented(check) if within is None else within
         points, ideal = points_of(kept), check.corrected_T[rows]
         some = spread(np.arange(len(points)), SOME_POINTS)
         charges = Charges.around(points, check.gap_m)
@@ -410,7 +410,7 @@ def join_maps(
         say(f"checking {name}")
         check = check_map(data, say, progress)
         _refuse_disobedient(name, check)
-        checked.append(Checked.of(name, data, check))
+        checked.append(Checked.of(name, check))
     refuse_shared({one.name: (points_of(one.data), one.data["B_T"].values, one.check.noise_T)
                    for one in checked}, "join_maps")
     return join_checked(checked, Pace(say, progress), turn_rad)

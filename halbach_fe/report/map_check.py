@@ -489,12 +489,18 @@ def are_in_order(data: xr.Dataset) -> bool:
     return has_times(data) or not is_sorted(points_of(data))
 
 
-def page(data: xr.Dataset, check: MapCheck) -> Page:
+def page(found: MapCheck | JoinedMaps) -> Page:
+    """Return the page of the check of a map, or of joined maps."""
+    return joined_page(found) if isinstance(found, JoinedMaps) else check_page(found)
+
+
+def check_page(check: MapCheck) -> Page:
     """Return the page of the check of a map, and the maps that are made of it."""
+    data = check.data
     points, found, rows = points_of(data), sentences(check), residual_table(check)
     instrument, said = instrument_table(check), undetermined(check)
-    maps = _maps_of(data, check)
-    if (within := inner(data, check)) is not None:
+    maps = _maps_of(check)
+    if (within := inner(check)) is not None:
         maps["inner_map"] = within
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
@@ -504,7 +510,7 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     if doubt := doubt_of_times(data):
         found.append(doubt)
     return Page(
-        "check", TITLE, None, answer(check, in_order), check_summary(data, check), [
+        "check", TITLE, None, answer(check, in_order), check_summary(check), [
             Section([Items(found), Text(
                 f"{check.readings} readings at {check.points} points, "
                 f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
@@ -534,24 +540,24 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
         remarks=found)
 
 
-def _maps_of(data: xr.Dataset, check: MapCheck) -> dict[str, xr.Dataset]:
+def _maps_of(check: MapCheck) -> dict[str, xr.Dataset]:
     """Return the maps in the right axes, by the names of their files."""
-    return {"oriented_map": oriented(data, check)} | (
-        {"corrected_map": corrected(data, check)} if check.suffices else {})
+    return {"oriented_map": oriented(check)} | (
+        {"corrected_map": corrected(check)} if check.suffices else {})
 
 
-def check_summary(data: xr.Dataset, check: MapCheck) -> Plain:
+def check_summary(check: MapCheck) -> Plain:
     """Return the results as plain data, with `readings_sha256` of the maps to which they belong."""
-    return check.plain() | _hashes({"map": data} | _maps_of(data, check))
+    return check.plain() | _hashes({"map": check.data} | _maps_of(check))
 
 
 def _hashes(maps: Mapping[str, xr.Dataset]) -> Plain:
     return {"maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
 
 
-def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
+def corrected(check: MapCheck) -> xr.Dataset:
     """Return the map that a probe without errors would have made, without broken rows."""
-    turned = oriented(data, check)
+    turned = oriented(check)
     turned["B_T"] = turned["B_T"].copy(data=check.corrected_T[~check.excluded])
     return turned
 
@@ -681,9 +687,10 @@ def term_table(found: MapCheck | JoinedMaps) -> Rows:
             for term in found.terms]
 
 
-def joined_page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
+def joined_page(joined: JoinedMaps) -> Page:
     """Return the page of joined maps, with that of the check of each map."""
     found, poses, terms = joined_sentences(joined), pose_table(joined), term_table(joined)
+    maps = {name: check.data for name, check in joined.checks.items()}
     summary = joined.plain() | _hashes(maps) | {"joined_sha256": readings_sha256(joined.data)}
     return Page(
         "check", "Field maps, joined", None, joined_answer(joined), summary, [
@@ -706,4 +713,4 @@ def joined_page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
         {"Where the maps lie in the frame of the first one": poses,
          "The instrument, by all maps together": terms},
         files={"joined.csv": partial(write_map, joined.data)}, stem="joined", remarks=found,
-        folders={name: page(data, joined.checks[name]) for name, data in maps.items()})
+        folders={name: check_page(check) for name, check in joined.checks.items()})

@@ -215,10 +215,9 @@ def last_sections(figures: Figures, model: Mapping[str, str]) -> list[Section]:
 PAGES = {
     "Assembly": "assembly", "SimulatedCampaign": "campaign",
     "DemagnetizationMap": "demagnetization", "Diagnosis": "diagnosis", "FieldOnLines": "field",
-    "Forces": "forces",
-    "HomogeneityResult": "homogeneity", "InferenceResult": "inference",
-    "MultipoleTables": "multipoles", "MeasurementPlan": "plan", "MeasuredPrior": "prior",
-    "Designed": "ring_design",
+    "Forces": "forces", "HomogeneityResult": "homogeneity", "InferenceResult": "inference",
+    "MapCheck": "map_check", "JoinedMaps": "map_check", "MultipoleTables": "multipoles",
+    "MeasurementPlan": "plan", "MeasuredPrior": "prior", "Designed": "ring_design",
     "FilledTray": "shim_tray", "Shim": "shimming", "Solution": "solution",
     "SortedBlocks": "sorting", "Tolerance": "tolerance", "HomogeneityTolerance": "tolerance",
     "Verification": "verification"}
@@ -240,8 +239,7 @@ def page_of(result: object) -> Page:
         return page
     raise StudyError(must_be(
         "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
-        f"a {name}", "Of hf.check_map and hf.register the commands of these names write the "
-        "files."))
+        f"a {name}", "Of hf.register the command of this name writes the files."))
 
 
 def csv_file(
@@ -680,7 +678,8 @@ def write_report(result: object, folder: str | Path) -> Path:
     ----------
     result : Solution, InferenceResult, Diagnosis, Verification, FieldOnLines, MultipoleTables, \
 HomogeneityResult, Forces, MeasuredPrior, MeasurementPlan, Designed, FilledTray, Shim, \
-SortedBlocks, Assembly, Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
+SortedBlocks, Assembly, Tolerance, HomogeneityTolerance, DemagnetizationMap, MapCheck, JoinedMaps \
+or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path
         Folder for the files; it is made if it does not exist. As on the command line, it belongs to

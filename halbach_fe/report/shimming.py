@@ -48,7 +48,7 @@ from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 T = TypeVar("T")
 
 LITTLE = 0.05
-"""Part of the rms below which the gain of all moves together is called hardly worth the work."""
+"""Part of the rms below which the gain of all moves, or of an order, is called hardly worth it."""
 
 LIKELY = 0.5
 """Probability below which the answer says that a limit is not reached."""

@@ -41,7 +41,14 @@ from halbach_fe.report.page import (
     csv_file,
     legend_above,
 )
-from halbach_fe.report.shimming import LIKELY, aim_of, values_summary, values_table, within_limit
+from halbach_fe.report.shimming import (
+    LIKELY,
+    LITTLE,
+    aim_of,
+    values_summary,
+    values_table,
+    within_limit,
+)
 from halbach_fe.report.words import counted, in_a_row, ppm, probability
 
 T = TypeVar("T")
@@ -189,11 +196,9 @@ def _answer(found: SortedBlocks) -> Answer:
     orders = (f"in all random orders about {text(low)}" if text(low) == text(high) else
               f"in 95 % of random orders {text(low)} to {text(high)}")
     gains = sorted(1 - best / each for each in (own, float(np.median(found.random))))
-    # part of the rms below which the gain of sorting is called hardly worth the work
-    little = 0.05
-    hardly = "" if gains[0] >= little else (
-        "The order of the table is nearly as good already. " if gains[1] >= little > 1 - best / own
-        else "A random order is nearly as good. " if gains[1] >= little else
+    hardly = "" if gains[0] >= LITTLE else (
+        "The order of the table is nearly as good already. " if gains[1] >= LITTLE > 1 - best / own
+        else "A random order is nearly as good. " if gains[1] >= LITTLE else
         "The order hardly matters: the sorted one is "
         f"{' to '.join(dict.fromkeys(f'{100 * gain:.2g}' for gain in gains))}\u00a0% better than "
         "that of the table or a random one. ")

@@ -37,6 +37,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.coils import crosses_disc, distance_from_axis, distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
+from halbach_fe.measurement.campaign import SAME_PLACE_M
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import (
@@ -523,7 +524,7 @@ def _aliases(
     # which points on it are one
     same_radius, same_angle = 2e-6, 1e-6
     here = points[np.isclose(radii_of(points), radius, rtol=same_radius)
-                  & np.isclose(points[:, 2], z, atol=SAME_HEIGHT_M)]
+                  & np.isclose(points[:, 2], z, atol=SAME_PLACE_M)]
     own = len(np.unique(np.round(azimuths_of(here) / same_angle)))
     # orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
     # first; where circles are near the blocks or outside of the bore, the second is their decay
@@ -595,7 +596,7 @@ def _read_circles(
     settings, size = magnet.study.observation.positions, len(labels)
     plain = (observation.operator.shape == observation.analysis.shape
              and (observation.operator != observation.analysis).nnz == 0
-             and np.abs(observation.points - observation.map_points).max() < SAME_HEIGHT_M)
+             and np.abs(observation.points - observation.map_points).max() < SAME_PLACE_M)
     if not isinstance(settings, CirclePositions) or not plain:
         return []
     pick = sparse.eye_array(size, format="csr")
@@ -932,9 +933,6 @@ def _nearest_source(magnet: Magnet, radius: float, z: float) -> float:
         np.linalg.norm(circle - one.position_m, axis=1).min() for one in magnet.external.dipoles]
     return max(float(min(apart, default=np.inf)), radius / 200)
 
-
-SAME_HEIGHT_M = 1e-6
-"""Difference of z in m up to which points are on one circle."""
 
 
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:

@@ -36,13 +36,6 @@ from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.faulty_instrument import (
-    IDEAL_AXES,
-    FaultyInstrument,
-    columns,
-    stated_places,
-    stated_readings,
-)
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
@@ -50,6 +43,13 @@ from halbach_fe.synthetic.hidden_effects import (
     with_effects,
 )
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
+from halbach_fe.synthetic.hidden_effects.instrument_effects import (
+    IDEAL_AXES,
+    FaultyInstrument,
+    columns,
+    stated_places,
+    stated_readings,
+)
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import USUAL_ORDER, Elements, moment_field
 from halbach_fe.synthetic.reaction import (

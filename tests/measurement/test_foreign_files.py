@@ -14,7 +14,7 @@ from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import field_map, points_of, write_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
-from halbach_fe.measurement.formats.text import undecorated
+from halbach_fe.measurement.tables import undecorated
 from tests.conftest import processor_time
 from tests.measurement.foreign_files import (
     FIELD,

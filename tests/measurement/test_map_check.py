@@ -47,7 +47,7 @@ from halbach_fe.report.map_check import (
     verdict,
     weighted_note,
 )
-from halbach_fe.report.map_check import page as page_of_check
+from halbach_fe.report.page import write_report
 from halbach_fe.solver.session import NOT_KEPT
 from halbach_fe.study.measurement import Instrument
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
@@ -356,7 +356,7 @@ def test_an_imperfect_instrument(generator):
     assert NOISE_T < check.floor_rms_T < FLOOR * NOISE_T
     assert check.rms_as_given_T.max() > 50 * NOISE_T
     # the oriented map can be used as it is
-    kept = oriented(data, check)
+    kept = oriented(check)
     assert len(points_of(kept)) == len(GRID) - 2
     assert check_map(kept).orientation == ("x", "y", "z")
     text = " ".join(sentences(check))
@@ -559,9 +559,8 @@ def test_a_component_alone_shows_spikes_and_a_lag(generator, tmp_path):
     assert "Gains, axes, turns and places of sensors need three components" in sentences(check)[0]
     assert not any("gain of" in name for name in undetermined(check).split(";"))
     assert np.isnan(check.residual_T[:, 1:]).all()
-    (tmp_path / "check.json").write_text(json.dumps(
-        page_of_check(data, check).summary, allow_nan=False))
-    assert floor_of(tmp_path / "check.json", data) == {"Bx": check.floor_T[0]}
+    page = write_report(check, tmp_path / "check")  # as the command does
+    assert floor_of(page.with_name("check.json"), data) == {"Bx": check.floor_T[0]}
 
 
 @pytest.mark.parametrize(("axes", "obeys"), [((0,), False), ((0, 1), False), ((0, 2), True)])
@@ -983,12 +982,12 @@ def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
         assert said.trust.startswith(f"Only {'within 1' if along == 'r' else 'at z of 6'}")
         assert "times what noise" in said.trust
         assert "beyond that" in said.said
-        kept = inner(field_map(GRID, noise + 1e-3), replace(CLEAN, reach=reach))
+        kept = inner(replace(CLEAN, reach=reach, data=field_map(GRID, noise + 1e-3)))
         assert len(points_of(kept)) == np.sum(~worse)  # the region holds no other rows
         far = answer(replace(CLEAN, reach=reach, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
         assert far.said.startswith("Passed. ")  # in that region, to 2 % of the largest field
         assert far.command == "halbach-fe check DIR/inner_map.csv -o DIR2"
-    assert inner(field_map(GRID, noise + 1e-3), CLEAN) is None
+    assert inner(CLEAN) is None
     failed = answer(replace(CLEAN, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
     assert failed.said.startswith("Failed. ")  # control: it obeys nowhere
     assert "not described by a field without sources within its region" in failed.said
@@ -1023,7 +1022,8 @@ def test_what_is_no_noise_is_not_recommended_as_such(generator):
 
 
 CLEAN = MapCheck(
-    readings=945, points=315, spacing_m=STEP_M, size_T=0.1, orientation=("x", "y", "z"), alike=(),
+    data=field_map(GRID, np.full_like(GRID, 0.1)), readings=945, points=315, spacing_m=STEP_M,
+    size_T=0.1, orientation=("x", "y", "z"), alike=(),
     rms_as_given_T=np.full(3, NOISE_T), rms_T=np.full(3, NOISE_T), floor_T=np.full(3, NOISE_T),
     terms=(), broken={}, windows=("z", ()), noise_T=NOISE_T, position_noise_m=0.0, reach=None,
     structure=0.0, redundancy=0.8, excluded=np.zeros(315, bool), residual_T=np.zeros((315, 3)),

@@ -506,7 +506,7 @@ def pole_maps(generator, *grids):
         field = 1e-4 * away / np.linalg.norm(away, axis=1)[:, None]**3
         data = field_map(points, field + 1e-6 * generator.standard_normal(field.shape))
         (one,) = as_checked({f"part{number}": data}, 1.6e-6)
-        found.append(map_join.Checked.of(one.name, data, replace(
+        found.append(map_join.Checked.of(one.name, replace(
             one.check, spacing_m=step, gap_m=max(2.5 * step, 0.03), noise_T=1e-6)))
     return found
 
@@ -565,7 +565,7 @@ def coarse_maps(seed, far):
         noise = 2e-4 * np.median(np.linalg.norm(field, axis=1))
         data = field_map(points, field + noise * generator.standard_normal(field.shape))
         (one,) = as_checked({name: data}, 1.6 * noise)
-        maps.append(map_join.Checked.of(name, data, replace(
+        maps.append(map_join.Checked.of(name, replace(
             one.check, spacing_m=0.01, gap_m=0.025, noise_T=noise)))
     return maps, [(Rotation.identity(), 0 * shift), (turn, shift)]
 

@@ -23,7 +23,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.faulty_instrument import stated_places
+from halbach_fe.synthetic.hidden_effects.instrument_effects import stated_places
 from halbach_fe.synthetic.simulate import real_places
 from tests.conftest import changed, circle
 from tests.support.short_dipole import TEXT as SHORT

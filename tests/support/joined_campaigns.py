@@ -83,13 +83,13 @@ def as_checked(maps: dict[str, xr.Dataset], floor: float = 1.6 * NOISE_T) -> lis
     for name, data in maps.items():
         field = np.asarray(data["B_T"].values)
         check = MapCheck(
-            readings=field.size, points=len(field), spacing_m=STEP_M,
+            data=data, readings=field.size, points=len(field), spacing_m=STEP_M,
             size_T=float(np.linalg.norm(field, axis=1).max()), orientation=("x", "y", "z"),
             alike=(), rms_as_given_T=np.zeros(3), rms_T=np.zeros(3), floor_T=np.full(3, floor),
             terms=(), broken={}, windows=("z", ()), noise_T=NOISE_T, position_noise_m=0.0,
             reach=None, structure=0.0, redundancy=1.0, excluded=np.zeros(len(field), bool),
             residual_T=0 * field, unseen_T=0 * field, corrected_T=field, gap_m=2.5 * STEP_M)
-        found.append(Checked.of(name, data, check))
+        found.append(Checked.of(name, check))
     return found
 
 

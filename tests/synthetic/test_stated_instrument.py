@@ -20,7 +20,7 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.faulty_instrument import stated_places, stated_readings
+from halbach_fe.synthetic.hidden_effects.instrument_effects import stated_places, stated_readings
 from halbach_fe.synthetic.simulate import simulate_campaign
 
 STATED = {

@@ -21,7 +21,7 @@ from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import Line, is_comment, lines_of, uncommented
+from halbach_fe.measurement.tables import MAX_LINE, Line, is_comment, lines_of, uncommented
 from halbach_fe.study.types import COMPONENTS
 
 PER_M = 100.0
@@ -32,8 +32,6 @@ NAMES = {"X": ("x", "cm"), "Y": ("y", "cm"), "Z": ("z", "cm"), "Fx": ("Bx", "T")
 NEAR = 0.01
 """Largest distance of a column's coordinate from that of the keys, in steps of the grid: columns
 are printed with few digits."""
-MAX_LINE = 200
-"""Number of characters of a line of the header that are searched."""
 
 
 def is_bdsim(lines: Sequence[Line]) -> bool:

@@ -29,7 +29,8 @@ from halbach_fe.geometry.array_layout import nominal_free_blocks
 from halbach_fe.measurement.block_table import REMANENT, BlockTable
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.instrument import to_magnet_axes
+from halbach_fe.measurement.tables import (
     Line,
     cells_of,
     comma_hint,
@@ -40,7 +41,6 @@ from halbach_fe.measurement.formats.text import (
     text_of_table,
     uncommented,
 )
-from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.solver.exact_block_field import remanence_per_polarization
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS

@@ -25,7 +25,7 @@ from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import points_on
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.tables import (
     Line,
     comments_of,
     delimiter_of,

@@ -25,8 +25,13 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import Line, comma_hint
-from halbach_fe.measurement.tables import look_like_clock, times_from_clock, times_from_texts
+from halbach_fe.measurement.tables import (
+    Line,
+    comma_hint,
+    look_like_clock,
+    times_from_clock,
+    times_from_texts,
+)
 from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",

@@ -29,7 +29,9 @@ from halbach_fe.measurement.formats import names
 from halbach_fe.measurement.formats.conversion import ForeignTable, with_units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
+from halbach_fe.measurement.tables import (
+    MAX_LINE,
     RUN_TOGETHER,
     Line,
     cells_of,
@@ -44,7 +46,6 @@ from halbach_fe.measurement.formats.text import (
     uncommented,
     undecorated,
 )
-from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
 MARKED = re.compile(r"(?i)^(variables\s*=|[;*$]\s)\s*|\s\*$")
 """What stands before a header: of Tecplot, of MAD-X, and of comments in other programs."""
@@ -73,8 +74,8 @@ KICKS = re.compile(r"(?i)\bkick[ _-]?(?:map|angles?)\b|\b(?:horizontal|vertical)
 MAX_COUNTS = 4
 MAX_HEADER = 20_000
 """Number of characters of a line that are read as names of columns."""
-MAX_LINE, MAX_REMARKS = 200, 5
-"""Number of characters of such a line that are searched, and of such lines that are told."""
+MAX_REMARKS = 5
+"""Number of such lines that are told."""
 
 
 def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:

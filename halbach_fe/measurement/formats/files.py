@@ -49,9 +49,8 @@ from halbach_fe.measurement.formats.grid import (
     read_fluka,
     read_srw,
 )
-from halbach_fe.measurement.formats.text import Line, lines_of, text_of_table
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
-from halbach_fe.measurement.tables import csv_table, finite
+from halbach_fe.measurement.tables import Line, csv_table, finite, lines_of, text_of_table
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(

@@ -28,15 +28,15 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import CARTESIAN, ColumnName, in_units
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.tables import (
     Line,
     comments_of,
     delimiter_of,
+    finite,
     is_comment,
     lines_of,
     rows_of,
 )
-from halbach_fe.measurement.tables import finite
 
 COMMAND = re.compile(r"\s*(param|grid|cylinder|time|extend[XYZ]|data)\b(.*)")
 ARGUMENT = re.compile(r"(\w{1,20})\s*=\s*([^\s=]{1,60})")

@@ -37,15 +37,16 @@ from halbach_fe.measurement.field_map import points_of, refuse_total_field
 from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import CARTESIAN, in_units
-from halbach_fe.measurement.formats.text import (
+from halbach_fe.measurement.tables import (
+    MAX_LINE,
     Line,
     comments_of,
     delimiter_of,
+    finite,
     is_comment,
     lines_of,
     rows_of,
 )
-from halbach_fe.measurement.tables import finite
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3
@@ -144,8 +145,6 @@ STATEMENT = re.compile(r"#\s*([-+.\deE]{1,30})\s*#?\s*(initial|step of|number of
 KEYS = ("initial", "step of", "number of points vs")
 CARD, GRID_3D, WIDTH = "MGNCREAT", 300.0, 10
 CARDS = re.compile(r"(?i)\s*(MGNCREAT|MGNDATA)\b")
-MAX_LINE = 200
-"""Number of characters of a line of the header that are searched."""
 
 
 def is_srw(lines: Sequence[Line]) -> bool:

@@ -32,7 +32,7 @@ from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
+from halbach_fe.measurement.tables import MAX_LINE, Line, lines_of, rows_of
 from halbach_fe.study.materials import MU_0
 
 COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
@@ -40,13 +40,11 @@ COLUMN = re.compile(r"\s*([1-9]\d?)\s+([A-Za-z][^\s\[]*)\s*(?:\[([^\[\]]*)\])?\s
 END = re.compile(r"\s*0\s*(?:\[([^\[\]]*)\])?\s*")
 EXPORTED = (" 1 X [METRE]", " 2 Y [METRE]", " 3 Z [METRE]", " 4 BX [TESLA]", " 5 BY [TESLA]",
             " 6 BZ [TESLA]", " 7 BMOD/HMOD", " 0 [METRE]")
-MAX_HEADER = 200
-"""Largest number of characters of a line of the header."""
 
 
 def is_opera(lines: Sequence[Line]) -> bool:
     """Return whether the first lines are those of an Opera table."""
-    first = [line for _, line in lines[:2] if len(line) <= MAX_HEADER]
+    first = [line for _, line in lines[:2] if len(line) <= MAX_LINE]
     return len(first) == 2 and bool(COUNTS.fullmatch(first[0])) and bool(COLUMN.fullmatch(first[1]))
 
 
@@ -59,7 +57,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If the header is not that of an Opera table, or states another number of points than follow.
     """
     lines = lines_of(raw, declared, where)
-    counts = COUNTS.fullmatch(lines[0][1][:MAX_HEADER])
+    counts = COUNTS.fullmatch(lines[0][1][:MAX_LINE])
     if not counts:
         raise MeasurementError(must_be("first line", where, "the three counts of an Opera table",
                                        f"'{lines[0][1].strip()[:40]}'"))
@@ -78,7 +76,7 @@ def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[ColumnName, ...],
     """Return the columns, the unit of all lengths, and the index of the first row."""
     columns: list[ColumnName] = []
     for index, (number, line) in enumerate(lines[1:], 1):
-        line = line[:MAX_HEADER]
+        line = line[:MAX_LINE]
         if end := END.fullmatch(line):
             if not columns:
                 break

@@ -12,9 +12,9 @@ import numpy as np
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.types import wrong_unit
-from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
+from halbach_fe.synthetic.hidden_effects.instrument_effects import FaultyInstrument
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 EFFECTS: dict[str, HiddenEffect] = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from halbach_fe.core.arrays import radii_of
 from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
-from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.shapes import Vector
 from halbach_fe.synthetic.true_magnet import TrueMagnet
+
+if TYPE_CHECKING:  # effects of this type belong to it
+    from halbach_fe.synthetic.hidden_effects.instrument_effects import FaultyInstrument
 
 Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "vacuum", "few blocks",
                "x", "y", "z", "circles", "axes"]
