@@ -7,8 +7,15 @@ symmetric magnet. To write the plane or extruded mesh of a study by hand::
     python -m halbach_fe.geo STUDY.toml -o FOLDER
 """
 
-from halbach_fe.geo.extruded import fewest_triangles, layers, mesh_2d, mesh_3d, plane_size
-from halbach_fe.geo.meridian import grid_size, mesh_meridian
+from halbach_fe.geo.magnet_meshes import (
+    fewest_triangles,
+    grid_size,
+    layers,
+    mesh_2d,
+    mesh_3d,
+    mesh_meridian,
+    plane_size,
+)
 
-__all__ = ["fewest_triangles", "grid_size", "layers", "mesh_2d", "mesh_3d", "mesh_meridian",
-           "plane_size"]
+__all__ = [
+    "fewest_triangles", "grid_size", "layers", "mesh_2d", "mesh_3d", "mesh_meridian", "plane_size"]

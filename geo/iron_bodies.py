@@ -1,7 +1,7 @@
 """Mesh of bodies of iron and of the air near them, in curved tetrahedra of second order.
 
 Blocks do not shape it. Around the air lies a shell that GetDP maps to the rest of space.
-Rings of iron about z are meshed in `meridian`, or as sectors with the blocks in `extruded`.
+Rings of iron about z are meshed, or as sectors with the blocks, in `magnet_meshes`.
 """
 
 from __future__ import annotations

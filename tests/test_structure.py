@@ -52,7 +52,7 @@ def imports(path):
 
 
 def module_of(path):
-    """Name of a file's module within the package: ``solver.mesh``, ``geo.extruded``."""
+    """Name of a file's module within the package: ``solver.mesh``, ``geo.magnet_meshes``."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     parts = parts[1:] if parts[0] == "halbach_fe" else parts
     return ".".join(parts).removesuffix(".__init__")

@@ -18,16 +18,8 @@ from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
-from halbach_fe.report.page import (
-    COLOURS_OF_COMPONENTS,
-    Page,
-    Section,
-    Table,
-    View,
-    chart,
-    geometry_figure,
-)
-from halbach_fe.report.point_maps import curve, maps_figure
+from halbach_fe.report.page import COLOURS_OF_COMPONENTS, Page, Section, Table, View, chart
+from halbach_fe.report.point_maps import curve, geometry_figure, maps_figure
 from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS

@@ -30,15 +30,8 @@ from halbach_fe.report.campaign_folders import (
     read_chapters,
     versions,
 )
-from halbach_fe.report.page import (
-    Plain,
-    Rows,
-    geometry_figure,
-    own_style,
-    png_of,
-    programs,
-    rendered,
-)
+from halbach_fe.report.page import Plain, Rows, own_style, png_of, programs, rendered
+from halbach_fe.report.point_maps import geometry_figure
 from halbach_fe.report.words import counted, in_a_row, in_one_line, within_a_sentence
 from halbach_fe.study.model import Study
 

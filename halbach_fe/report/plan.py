@@ -28,12 +28,12 @@ from halbach_fe.report.page import (
     chart,
     columns_by_axis,
     csv_file,
-    draw_cross_section,
     figure_of,
     label_logarithmic,
     legend_above,
     linearized,
 )
+from halbach_fe.report.point_maps import draw_cross_section
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import Study
 

@@ -1,5 +1,6 @@
-"""Pictures of numbers at the points of a map that fit how these lie (on a line, around a circle,
-over angle and z, or in slices), and of the readings that prior and posterior predict.
+"""Pictures of the points of a map: where they are in the magnet, numbers at them that fit how they
+lie (on a line, around a circle, over angle and z, or in slices), and of the readings that prior and
+posterior predict.
 """
 
 from __future__ import annotations
@@ -12,9 +13,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon, Rectangle
 from scipy import special
+from scipy.spatial import ConvexHull
 
-from halbach_fe.core.arrays import Bools, Floats, Ints, degrees_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, box_middle, degrees_of, radii_of
+from halbach_fe.geometry.iron import IronSolid
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.inference.result import (
     COVERAGE_Z,
     HELD_OUT,
@@ -26,10 +32,13 @@ from halbach_fe.inference.result import (
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.report.page import (
+    IRON,
     MEASURED,
+    MOST_MEASURED,
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    SMALL,
     chart,
     charts,
     figure_of,
@@ -459,3 +468,151 @@ def _scale(axis: Axes, scores: Floats) -> None:
         axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
     axis.set_ylim(-limit, limit)
+
+
+MOST_POINTING = 500
+"""Largest number of blocks in a cross-section that have arrows: an arrow takes 10 ms, and more of
+them than this cannot be told apart."""
+
+
+def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
+    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
+
+    ``colour`` is that of the blocks. Their slots have numbers and their easy axes are drawn, unless
+    there are too many to read.
+    """
+    # Distance from a block's middle to its outer side, relative to that from the axis, below which
+    # a number has no place in it.
+    small_block = 0.15
+    # Distance from the axis, relative to that of the farthest block, from which blocks are
+    # numbered: those of an inner layer have the same slots.
+    outermost = 0.9
+    most_numbered = 40  # largest number of blocks in a cross-section whose slots are numbered
+    height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
+    shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
+        block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
+    reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
+    numbered = reach > 0 and len(shown) <= most_numbered
+    outlines = [1e3 * block.from_frame(at_heights(along_edges(block.outline, 9), 0.0))[:, :2]
+                for block in shown]
+    if len(shown) > MOST_POINTING:
+        axis.plot(*np.vstack([part for outline in outlines for part in (
+            outline, [[np.nan, np.nan]])]).T, color=colour, lw=0.3)
+        shown = []
+    for block, outline in zip(shown, outlines, strict=False):
+        axis.plot(*outline.T, color=colour, lw=0.6)
+        middle = box_middle(outline)
+        arrow = 0.3 * float(np.ptp(outline, axis=0).min()) * np.array(block.easy_axis[:2])
+        axis.annotate("", tuple(middle + arrow), tuple(middle - arrow),
+                      arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
+        distance = float(np.hypot(*middle))
+        if numbered and distance > outermost * reach:
+            outwards = middle / distance
+            edge = float((outline @ outwards).max())
+            # between the arrow and the outer side of a large block, beyond that of a small one
+            beyond = edge - distance < small_block * reach
+            if beyond:
+                axis.margins(0.12)
+            axis.annotate(
+                str(block.slot),
+                tuple(outwards * (edge if beyond else 0.25 * distance + 0.75 * edge)),
+                tuple(outwards * (SMALL if beyond else 0)), textcoords="offset points",
+                ha="center", va="center", fontsize=SMALL, color=colour)
+    for body in magnet.iron:
+        if body.sphere or not body.in_place:  # its shadow
+            shadow = np.column_stack([part.ravel() for part in body.surface[:2]])
+            axis.add_patch(Polygon(1e3 * shadow[ConvexHull(shadow).vertices], fill=False,
+                                   color=IRON, lw=0.8))
+            continue
+        if body.outline is not None:
+            axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])
+                                    for edge in body.outline], fill=False, color=IRON, lw=0.8))
+            continue
+        for radius in (body.inner_radius, body.outer_radius):
+            axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
+
+
+def _inner_radii(magnet: Magnet) -> list[float]:
+    """Return the smallest distance in m of every ring's blocks from the z axis.
+
+    Of a block with flat sides that is the distance of an edge, which no corner has.
+    """
+    if len(magnet.blocks) > MOST_MEASURED:
+        return [inner for _, (inner, _) in magnet.ring_sections]
+    found = dict[int, float]()
+    for block in magnet.blocks:
+        x, y, _ = block.from_frame(at_heights(along_edges(block.outline, 33), 0.0)).T
+        found[block.ring] = min(float(np.hypot(x, y).min()), found.get(block.ring, np.inf))
+    return list(found.values())
+
+
+def _side_of(body: IronSolid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the limits in m of a body along z, and of its distances from the z axis.
+
+    Of a body of triangles they are those of its shadow along z; of prisms, spheres and tubes that
+    are not about that axis, those of the hull of the shadow.
+    """
+    x, y, z = body.surface
+    ends, reach = (float(z.min()), float(z.max())), float(np.hypot(x, y).max())
+    if body.is_coaxial:
+        return ends, (body.inner_radius, reach)
+    shadow = np.stack([x, y], axis=2)
+    if body.triangles is None:
+        shadow = shadow.reshape(-1, 2)
+        shadow = shadow[ConvexHull(shadow).vertices][None]
+    return ends, (_from_axis(shadow), reach)
+
+
+def _from_axis(polygons: Floats) -> float:
+    """Return the distance of the origin from convex polygons (m, n, 2), 0 within one of them."""
+    along = np.roll(polygons, -1, axis=1) - polygons
+    left = polygons[..., 0] * along[..., 1] - polygons[..., 1] * along[..., 0]
+    if ((left > 0).all(axis=1) | (left < 0).all(axis=1)).any():
+        return 0.0
+    share = np.clip(-np.sum(polygons * along, axis=2) / np.maximum(
+        np.sum(along**2, axis=2), np.finfo(float).tiny), 0, 1)  # sides of walls along z are points
+    return float(np.linalg.norm(polygons + share[..., None] * along, axis=2).min())
+
+
+def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
+    """Draw the positions of readings in the cross-section of the magnet.
+
+    If the positions are not in a single plane, a second panel shows them by z and distance from
+    the axis; of a cross-section, which has no ends, none does.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    others : ndarray, shape (m, 3), in m, optional
+        Positions of held-out readings.
+    """
+    flat = magnet.dimension == 2 or np.ptp(points[:, 2]) == 0
+    figure = figure_of(5.8, 5.5) if flat else figure_of(4.2)
+    left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
+    draw_cross_section(left, magnet)
+    left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
+    for axis in right:
+        axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
+        axis.grid(alpha=0.3)
+        for (z_limits, (_, outer)), inner in zip(
+                magnet.ring_sections, _inner_radii(magnet), strict=True):
+            axis.add_patch(Rectangle(
+                (1e3 * z_limits[0], 1e3 * inner), 1e3 * (z_limits[1] - z_limits[0]),
+                1e3 * (outer - inner), fill=False, color="#777777", lw=0.6))
+        for body in magnet.iron:
+            (start, end), (inner, outer) = _side_of(body)
+            axis.add_patch(Rectangle((1e3 * start, 1e3 * inner), 1e3 * (end - start),
+                                     1e3 * (outer - inner), fill=False, color=IRON, lw=0.8))
+    for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
+                                            (others, "x", PRIOR, "held out")):
+        if positions is None:
+            continue
+        x, y, z = 1e3 * positions.T
+        left.plot(x, y, marker, ms=3, color=colour, label=name)
+        for axis in right:
+            axis.plot(z, np.hypot(x, y), marker, ms=3, color=colour)
+    for axis in right:
+        axis.set_ylim(0, None)  # last, because setting a limit ends the automatic scaling
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2,
+                  markerscale=3)
+    return figure

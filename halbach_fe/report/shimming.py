@@ -38,10 +38,10 @@ from halbach_fe.report.page import (
     Table,
     Text,
     chart,
-    draw_cross_section,
     legend_above,
     linearized,
 )
+from halbach_fe.report.point_maps import draw_cross_section
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_unit
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 

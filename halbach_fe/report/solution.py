@@ -29,12 +29,11 @@ from halbach_fe.report.page import (
     Table,
     View,
     charts,
-    geometry_figure,
     label_logarithmic,
     last_sections,
     legend_above,
 )
-from halbach_fe.report.point_maps import curve, maps_figure
+from halbach_fe.report.point_maps import curve, geometry_figure, maps_figure
 from halbach_fe.report.words import (
     ROUNDING,
     counted,

@@ -27,11 +27,11 @@ from halbach_fe.report.page import (
     chart,
     columns_by_axis,
     csv_file,
-    geometry_figure,
     label_logarithmic,
     last_sections,
     legend_above,
 )
+from halbach_fe.report.point_maps import geometry_figure
 from halbach_fe.report.words import (
     ROUNDING,
     decimals,

@@ -368,7 +368,9 @@ def assemble_modes(
     GetDPError
         If GetDP fails, or its matrix differs from that of our own Gauss points.
     """
-    from halbach_fe.geo.meridian import mesh_half_plane  # imports Gmsh, which only meshing needs
+    from halbach_fe.geo.magnet_meshes import (
+        mesh_half_plane,  # imports Gmsh, which only meshing needs
+    )
 
     r, z = grid_lines(bodies, resolution)
     body = iron_cells(bodies, r, z)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -123,6 +123,17 @@ class IronMaterial(StudyModel):
         return self
 
 
+Tube = TypeVar("Tube", "IronRing", "IronTube")
+
+
+def _with_a_wall(tube: Tube) -> Tube:
+    """Return a tube whose radii leave iron between them."""
+    if tube.outer_radius_m <= tube.inner_radius_m:
+        raise ValueError(f"outer_radius_m ({tube.outer_radius_m}) must be larger than "
+                         f"inner_radius_m ({tube.inner_radius_m})")
+    return tube
+
+
 class IronRing(IronMaterial):
     """A coaxial iron tube outside the array.
 
@@ -134,14 +145,7 @@ class IronRing(IronMaterial):
     outer_radius_m: Length
     length_m: Length | None = None
 
-    @model_validator(mode="after")
-    def _consistent(self) -> IronRing:
-        if self.outer_radius_m <= self.inner_radius_m:
-            raise ValueError(
-                f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
-                f"({self.inner_radius_m})"
-            )
-        return self
+    _consistent = model_validator(mode="after")(_with_a_wall)
 
 
 class PlacedIron(StudyModel):
@@ -236,12 +240,7 @@ class IronTube(PlacedIron):
     length_m: Length | None = None
     z_m: Place = 0.0
 
-    @model_validator(mode="after")
-    def _consistent(self) -> IronTube:
-        if self.outer_radius_m <= self.inner_radius_m:
-            raise ValueError(f"outer_radius_m ({self.outer_radius_m}) must be larger than "
-                             f"inner_radius_m ({self.inner_radius_m})")
-        return self
+    _consistent = model_validator(mode="after")(_with_a_wall)
 
 
 Polygon = Annotated[tuple[tuple[Coordinate, Coordinate], ...],

@@ -53,9 +53,9 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
-    draw_cross_section,
     write_files,
 )
+from halbach_fe.report.point_maps import draw_cross_section
 from halbach_fe.report.registration import place_table, pose_table
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import read_study

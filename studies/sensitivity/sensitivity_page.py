@@ -25,11 +25,11 @@ from halbach_fe.report.page import (
     Table,
     Text,
     csv_file,
-    draw_cross_section,
     figure_of,
     label_logarithmic,
     legend_above,
 )
+from halbach_fe.report.point_maps import draw_cross_section
 from halbach_fe.report.words import flux_density, fraction
 
 

@@ -62,7 +62,7 @@ def test_only_what_is_imported_counts(toy, changed, matters):
 
 def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
     names = {f"{path.parent.name}/{path.name}" for path in sources("halbach_fe.response.matrix")}
-    assert {"geo/extruded.py", "pro/azimuthal_modes.pro", "pro/case.pro.j2",
+    assert {"geo/magnet_meshes.py", "pro/azimuthal_modes.pro", "pro/case.pro.j2",
             "stats/posteriors.py", "solver/exact_block_field.py"} <= names
     assert not any(name.startswith(("report/", "cli/", "diagnosis/")) for name in names)
 

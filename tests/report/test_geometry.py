@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.page import geometry_figure
+from halbach_fe.report.point_maps import geometry_figure
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
 

@@ -12,7 +12,7 @@ import tomlkit
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import magnet_view_3d, page
+from halbach_fe.report import magnet_view_3d, page, point_maps
 from halbach_fe.report import solution as solution_page
 from halbach_fe.report.magnet_view_3d import cut_trace
 from halbach_fe.report.page import write_files
@@ -94,8 +94,8 @@ def test_multipoles_say_that_there_is_no_axis(dimension, session):
 
 def test_very_many_blocks(monkeypatch):
     """Above their limits pictures draw less and say so."""
-    for module, name in ((magnet_view_3d, "MOST_UNEQUAL"), (page, "MOST_POINTING"),
-                         (page, "MOST_MEASURED"), (magnet_view_3d, "MOST_SUMMED")):
+    for module, name in ((magnet_view_3d, "MOST_UNEQUAL"), (point_maps, "MOST_POINTING"),
+                         (point_maps, "MOST_MEASURED"), (magnet_view_3d, "MOST_SUMMED")):
         monkeypatch.setattr(module, name, 20)
     places = [(0.025 * i, 0.025 * j, 0.03 * k)
               for i in range(-2, 3) for j in range(-2, 3) for k in range(2)]
@@ -108,7 +108,7 @@ def test_very_many_blocks(monkeypatch):
     assert kept.colours.words[[block.name for block in blocks].index("b31")] == "w31"
     assert cut_trace(magnet) is None
     figure, axis = plt.subplots()
-    page.draw_cross_section(axis, magnet)
+    point_maps.draw_cross_section(axis, magnet)
     assert len(axis.lines) == 1
     assert not axis.texts
     plt.close(figure)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from halbach_fe import geo
-from halbach_fe.geo import extruded
+from halbach_fe.geo import magnet_meshes
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -82,9 +82,9 @@ def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
 def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
     magnet = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
     kind = "cross_section" if magnet.dimension == 2 else "extruded"
-    monkeypatch.setattr(extruded, "COUNTED", np.inf)
+    monkeypatch.setattr(magnet_meshes, "COUNTED", np.inf)
     real, rim = geo.plane_size(magnet, kind)
-    monkeypatch.setattr(extruded, "COUNTED", real / 4)
+    monkeypatch.setattr(magnet_meshes, "COUNTED", real / 4)
     found, its_rim = geo.plane_size(magnet, kind)
     assert found != real
     assert within(COUNT_FACTOR, found, real)
@@ -96,7 +96,7 @@ def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
 def test_large_rings_are_drawn_in_part(studies, monkeypatch):
     study = studies["many blocks"]
     found, _ = geo.plane_size(build_magnet(study), "cross_section")
-    monkeypatch.setattr(extruded, "DRAWN", 512)
+    monkeypatch.setattr(magnet_meshes, "DRAWN", 512)
     real, _ = geo.plane_size(build_magnet(study), "cross_section")
     assert found != real
     assert within(COUNT_FACTOR, found, real)

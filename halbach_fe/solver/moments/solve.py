@@ -164,9 +164,7 @@ class System:
     def solve(self, applied: Applied | None = None) -> Moments:
         """Return the polarization of the blocks in their own field and an applied one."""
         cells, interaction = self.interaction.cells, self.interaction
-        outer = np.zeros_like(cells.nodes)
-        if applied is not None:
-            outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
+        outer = _at_nodes(applied, cells)
         mean_outer = cells.mean(outer)
         scale = float(np.abs(self.remanence).max(initial=0.0) + np.abs(mean_outer).max(initial=0.0))
         if scale == 0:
@@ -212,6 +210,12 @@ class System:
             f"The polarization of the blocks does not settle in {MAX_STEPS} steps: the last "
             f"changed it by {np.abs(step).max() / scale:.1e} of the remanence. Please report this "
             "with the study.")
+
+
+def _at_nodes(applied: Applied | None, cells: Cells) -> Floats:
+    """Return an applied field at the nodes of cells, like them (cells, nodes, 3), in T."""
+    return np.zeros_like(cells.nodes) if applied is None else applied(
+        cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
 
 
 def _shape(block: MagnetBlock) -> MagnetBlock:
@@ -601,10 +605,7 @@ def solve_irreversible(
     interaction, chi, cells = system.interaction, system.susceptibility, system.interaction.cells
     strength = np.linalg.norm(system.remanence, axis=1)
     easy = system.remanence / np.where(strength > 0, strength, 1.0)[:, None]
-    outer = np.zeros_like(cells.nodes)
-    if applied is not None:
-        outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
-
+    outer = _at_nodes(applied, cells)
     outer_along, outer_mean = np.einsum("nqi,ni->nq", outer, easy), cells.mean(outer)
 
     def kept(along: Floats, polarization: Floats) -> tuple[Floats, Floats]:
