@@ -1,7 +1,9 @@
-"""Functions that numba compiles, threads for them, and the memory that is left."""
+"""Functions that numba compiles, threads for them, and memory: what is left, what is given back."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -94,3 +96,13 @@ def available_memory() -> float | None:
     except (OSError, KeyError, ValueError):
         pass
     return min(limits, default=None)
+
+
+def return_memory() -> None:
+    """Return memory that is free to the system, which the C library of Linux else keeps.
+
+    Factors of large matrices come and go in pieces between which small objects stay: fits that
+    solved for an iron ring again and again held 15 GiB, 10 of which were free.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # of another C library
+        ctypes.CDLL(None).malloc_trim(0)

@@ -45,6 +45,7 @@ from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of
 from halbach_fe.core.errors import NotConvergedError
+from halbach_fe.core.threads import return_memory
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.azimuthal_modes import to_cartesian
@@ -230,6 +231,7 @@ def solve_iron(
         If GetDP or Newton's method fails.
     """
     check_bodies(bodies)
+    return_memory()  # of an earlier solution, which nobody needs any more
     resolution = resolution or Resolution()
     modes = start.problem.modes if start else assemble_modes(name, bodies, resolution, session)
     samples = _sampled(modes, source)

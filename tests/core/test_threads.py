@@ -42,3 +42,21 @@ def test_one_thread_is_that_of_the_caller(monkeypatch, threads):
     in_threads(lambda first, last: seen.append((first, last, threading.get_ident())), shares)
     assert sorted(part[:2] for part in seen) == shares
     assert {who == threading.get_ident() for *_, who in seen} == {threads == 1}
+
+
+def test_memory_that_is_free_is_returned():
+    """Between pieces that stay, the C library keeps what was freed: the control."""
+    code = """
+from pathlib import Path
+from halbach_fe.core.threads import return_memory
+def held():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+empty = held()
+pieces = [bytearray(b"x" * 50_000) for _ in range(4000)]  # 200 MB
+kept = pieces[::100]
+del pieces
+kept_free = held()
+return_memory()
+assert kept_free > empty + 150 > held() + 100, (empty, kept_free, held())
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
