@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.magnets import magnet_of_blocks
+from halbach_fe.magnets import halbach_ring, magnet_of_blocks
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.interaction import Interaction
@@ -324,3 +324,26 @@ def test_bars_of_large_susceptibilities(generator, permeability):
     assert np.mean(np.concatenate(ratios) < 2) > 0.95
     if permeability == 2.0:
         assert np.mean(np.concatenate(small) < 2) < 0.9
+
+
+def test_bars_of_rings_whose_blocks_touch(generator):
+    """Quadrupoles of NdFeB, against 4 cells a side, of which a third of what they change is to
+    come: 95 % of the readings in the bore lie within two bars. The control are bars that do not
+    know of the susceptibility, as they were.
+    """
+    ratios, without = [], []
+    for shape, count, length in (("sector", 16, 0.03), ("sector", 12, 0.06),
+                                 ("trapezoid", 16, 0.06), ("trapezoid", 12, 0.12)):
+        blocks = halbach_ring(2, count, inner_radius_m=0.03, outer_radius_m=0.045, length_m=length,
+                              shape=shape, recoil_permeability=1.05).blocks
+        directions = generator.standard_normal((60, 3))
+        points = 0.02 * generator.uniform(0.2, 1.0, (60, 1)) * directions / np.linalg.norm(
+            directions, axis=1, keepdims=True)
+        fine, coarse = (system.solve() for system in refinement(blocks))
+        finer = solve_moments(blocks, cells_per_side=4).reaction(points)
+        for found, of in ((ratios, fine), (without, replace(fine, susceptibility=0.0))):
+            field, change = field_with_errors(of, coarse, points)
+            off = field - finer - (finer - field) / 3
+            found.append(np.linalg.norm(off, axis=1) / np.linalg.norm(change, axis=1))
+    assert np.mean(np.concatenate(ratios) < 2) > 0.95
+    assert np.mean(np.concatenate(without) < 2) < 0.9
