@@ -675,7 +675,6 @@ def shim(
     if stock is not None and not replacements:
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
                          "replaced; instead replacements is 0. Give replacements.")
-    result = result.of_blocks
     distributions_of(result.magnet, result)
     check_objective(result.magnet, reference, limit_units, limit_ppm)
     model = objective_of(result.magnet, reference, session.within("objective"),

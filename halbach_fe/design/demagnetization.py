@@ -198,8 +198,8 @@ class DemagnetizationMap(ShownInNotebook):
 
     @property
     def worst_when_cold(self) -> bool:
-        """Whether the coercivity rises with the temperature, as that of ferrite."""
-        return self.material.coercivity_coefficient_per_K > 0
+        """Whether more is past the knee in the cold, as of ferrite."""
+        return self.material.worst_when_cold
 
     def limit_temperature(self, share: float) -> float:
         """Return the highest temperature in °C with at most a share of the volume past the knee.
@@ -315,7 +315,7 @@ def demagnetization_map(
             "Add [demagnetization] with temperature_C"
             + (f", and {', '.join(keys)} from the data sheet." if keys else
                f": the rest is known of {magnet.array.material}.")))
-    if len({each.coercivity_coefficient_per_K > 0 for each in magnet.demagnetizations}) > 1:
+    if len({each.worst_when_cold for each in magnet.demagnetizations}) > 1:
         raise StudyError(must_be(
             "`material` of rings and blocks", f"study {magnet.name}", "all of ferrite or none",
             "both", "Ferrite loses magnetization in the cold, and other magnets in the heat."))

@@ -148,8 +148,11 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     size = np.hstack([of_size(others), of_size(matrix), of_size(offset)])
     mean = weights @ size
     apart = np.sqrt(weights)[:, None] * (size - mean)
-    scale = float(np.abs(response.nominal).max())
-    known = np.hstack([scale * apart[:, :-1], apart[:, -1:]])
+    # a magnetization may be as large as the largest one, an amplitude is of some sd
+    largest = float(np.abs(response.nominal).max())
+    scale = np.array([largest] * others.shape[1] + [
+        largest if name[-3:-1] == ".M" else 1.0 for name in response.parameters] + [1.0])
+    known = scale * apart
     values, vectors = np.linalg.eigh(known @ known.T)
     # smallest eigenvalue of the matrix of products that is kept, relative to the largest one;
     # smaller ones are rounding errors. What is left out changes rms deviations by less than 1e-6 of

@@ -392,8 +392,8 @@ def _best(
         return PPM / before.mean_T * weight * (
             along - (along @ model.weights[inner])[..., None])
 
-    field = (model.response.offset + model.response.matrix @ posterior.mean).reshape(-1, 3)
-    target = whitened(field[:len(inner)][inner] @ before.direction)
+    field = model.field(posterior.stacked.mean[:, None])[..., 0]
+    target = whitened(field[inner] @ before.direction)
     points = model.points[:len(inner)][inner]
     at_once = 1000  # points whose fields are in memory with all components
     effect = whitened(np.concatenate([

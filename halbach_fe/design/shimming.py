@@ -176,12 +176,19 @@ class Shim(ShownInNotebook):
 
     @cached_property
     def _changed(self) -> Magnet | None:
-        """The magnet after the moves, see `remounted`."""
-        slots = len(self.mounts.places)
+        """The magnet after the moves, see `remounted`.
+
+        Uncertain amplitudes of exceptions, which moves renumber, are left out if there are any.
+        """
+        slots, magnet = len(self.mounts.places), self.magnet
         every = [placement for step in self.steps for placement in step.move.placements]
+        if every:
+            magnet = magnet.with_(uncertain=tuple(
+                one for one in self.study.uncertain
+                if not any(name.startswith("array.exceptions") for name in one.change)))
         return remounted(
-            self.magnet, [(placement.to, placement.block, self.matrix(placement))
-                          for placement in every if placement.block < slots],
+            magnet, [(placement.to, placement.block, self.matrix(placement))
+                     for placement in every if placement.block < slots],
             [placement.to for placement in every if placement.block >= slots])
 
     def matrix(self, placement: Placement) -> Floats:
@@ -241,7 +248,7 @@ class _MoveModel:
     """Covariance factor of the mounted blocks, along the axes of the magnet.
     Shape (S, D, q), in A/m."""
     beside: Gaussian | None
-    """What the blocks of neighbours deviate, with the same columns."""
+    """Uncertain amplitudes and what the blocks of neighbours deviate, with the same columns."""
     loose_mean: Floats
     """Mean of the blocks once they are taken out, in own axes. Shape (B, D), in A/m."""
     loose: Floats
@@ -261,15 +268,20 @@ class _MoveModel:
     @cached_property
     def columns(self) -> Any:
         """The matrix of the objective, shape (1 + k, S, D)."""
-        return self.model.matrix.reshape(len(self.model.matrix), *self.mean.shape)
+        return self._of_blocks(self.model.matrix)
+
+    def _of_blocks(self, rows: Any) -> Any:
+        """Return the part (k, S, D) of rows (k, parameters) that is of the blocks."""
+        return rows[:, :self.mean.size].reshape(len(rows), *self.mean.shape)
 
     @cached_property
     def start(self) -> tuple[Any, Any]:
         """Mean (1 + k,) and root (1 + k, q) of the products with the matrix, without moves."""
         model: Any = self.model
+        blocks, others = np.hsplit(model.matrix, [self.mean.size])
         mean, root = Gaussian(
             self.mean.ravel(), self.placed.reshape(self.mean.size, -1), self.beside).products(
-                model.matrix, model.of_neighbours)
+                blocks, np.hstack([others, model.of_neighbours]))
         return model.offset + mean, root
 
     @cached_property
@@ -277,7 +289,7 @@ class _MoveModel:
         """What every block changes in every slot, relative to the main multipole or mean field as
         it is, which moves hardly change.
         """
-        scaled = self.model.scaled(self.main).reshape(-1, *self.mean.shape)
+        scaled = self._of_blocks(self.model.scaled(self.main))
         return Slots(np.einsum("qsi,sij->qsj", scaled, self.frames), self.loose_mean,
                      self.own @ self.own.transpose(0, 2, 1),
                      self.mounts.turns[:, :self.size, :self.size], self.fits,
@@ -465,11 +477,11 @@ def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:
         Covariance factors of w and of p. Their columns belong to the same independent variables, so
         that they also give the covariance between w and p.
     """
-    study, after = result.study, result.posterior
+    study, blocks, rounding = result.study, result.of_blocks, 1e-9
+    before, after = blocks.prior, blocks.posterior
     sd, root = np.radians(study.prior.mounting_sd_deg), np.asarray(after.root)
     if not sd:  # the prior has no mounting errors
         return after.mean, root, root
-    before, rounding = result.prior, 1e-9
     alone = prior_of_blocks(result.magnet)
     if result.measured_blocks is None and (before.sd < (1 - rounding) * alone.sd).any():
         before = alone  # that was an earlier update, which does not say what is of the mounting
@@ -514,6 +526,7 @@ def _build_move_model(
 ) -> _MoveModel:
     """Transform the posterior of the mounted blocks to own axes, and append the spare blocks."""
     size, count = result.study.dimension, len(mounts.places)
+    known = result.of_blocks.posterior
     mean, loose, placed = taken_out(result)
     back = mounts.frames[:, :size, :size].transpose(0, 2, 1)
     own_mean = np.vstack([np.einsum("nij,nj->ni", back, mean.reshape(count, size)),
@@ -529,8 +542,8 @@ def _build_move_model(
     fits[:, :, count + bound] = False
     fits[0, spares.slot[bound], count + bound] = True
     return _MoveModel(
-        model, mounts, result.posterior.mean.reshape(count, size),
-        placed.reshape(count, size, columns), _widened(result.posterior.beside, columns), own_mean,
+        model, mounts, known.mean.reshape(count, size),
+        placed.reshape(count, size, columns), _widened(known.beside, columns), own_mean,
         own_loose, _covariance_root(alone), fits)
 
 

@@ -476,21 +476,15 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def of_blocks(self) -> InferenceResult:
-        """The result without the uncertain amplitudes of the magnet among its parameters.
-
-        The error bars of the blocks contain them. It serves what moves blocks from slot to slot.
+        """The result with the uncertain amplitudes of the magnet beside its magnetizations, as what
+        neighbours' blocks deviate is. It serves what moves blocks from slot to slot.
         """
-        if not self.study.uncertain_of_magnet:
-            return self
         count = len(self.response.parameters) - len(self.study.uncertain_of_magnet)
-        prior, posterior = (
-            replace(each, mean=each.mean[:count], root=np.asarray(each.root)[:count])
-            for each in (self.prior, self.posterior))
-        response = replace(
-            self.response, matrix=self.response.whole[:, :count],
-            parameters=self.response.parameters[:count], nominal=self.response.nominal[:count])
-        return replace(self, magnet=self.magnet.with_(uncertain=()), prior=prior,
-                       posterior=posterior, response=response)
+        if count == len(self.response.parameters):
+            return self
+        prior, posterior = (each.stacked.split(count, len(each.stacked.mean) - count)
+                            for each in (self.prior, self.posterior))
+        return replace(self, prior=prior, posterior=posterior)
 
     @property
     def magnetizations(self) -> xr.Dataset:

@@ -400,6 +400,9 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
                        for name in one.uses(other) if name.endswith(".toml")), None)
         changed = differences(_plain(first), _plain(study))
         if source is not None and source[0].verb == "register":
+            if study.maps and not first.maps:  # the page of one map is of a study of that alone
+                changed = min((differences(_plain(first), _plain(study.of_map(number)))
+                               for number in range(len(study.maps))), key=len)
             # its numbers are on its own page
             changed = {key: values for key, values in changed.items()
                        if key.partition(".")[0] not in OF_MAPPER}

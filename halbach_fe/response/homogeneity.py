@@ -80,7 +80,8 @@ class Homogeneity:
 
     mean_T: float
     mean_sd_T: float
-    """Mean of |B| over the volume, for the mean magnetizations, and its standard deviation."""
+    """Mean of |B| over the volume, for the mean magnetizations, and its standard deviation, which
+    like all others includes the solver's error."""
     direction: Floats
     """Direction of the mean of B. Shape (3,)."""
     direction_sd_rad: float
@@ -156,11 +157,16 @@ class HomogeneityModel:
     ) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.
 
-        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`.
+        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`. The drawn
+        fields differ by the solver's error too.
         """
+        generator = np.random.default_rng(seed)
         mean = self.field(parameters.stacked.mean[:, None])[..., 0]
-        return self.of_fields(
-            mean, self.drawn(parameters, DRAWS, np.random.default_rng(seed)), measured)
+        drawn = self.drawn(parameters, DRAWS, generator)
+        if len(errors := self.response.shared_error[:, :mean.size]):
+            drawn = drawn + (errors.T @ generator.standard_normal((len(errors), DRAWS))).reshape(
+                drawn.shape)
+        return self.of_fields(mean, drawn, measured)
 
     def drawn(
         self, parameters: Gaussian, count: int, generator: np.random.Generator

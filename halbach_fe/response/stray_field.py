@@ -199,8 +199,8 @@ def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) ->
     if magnet.is_vacuum:
         return vacuum
     alone = magnet.with_(external=External())
-    # beside iron of any shape as for the readings: without other sources that is solved already
-    as_readings = not magnet.iron_is_axisymmetric
+    # beside iron as for the readings: without other sources that is solved already
+    as_readings = bool(magnet.iron)
     reaction = solve_separate(
         alone if magnet.has_losses or as_readings else alone.with_(mesh__cells_per_side=1),
         session.within("stray"), estimate=as_readings)
@@ -227,20 +227,22 @@ def _farthest(
 ) -> tuple[float, Floats | None]:
     """Return the largest distance in m at which |B| reaches a limit, and the point (3,) in m.
 
-    The search begins with some distances in m. If |B| is smaller at the distance
+    The search begins at the last of some distances in m and goes on outwards, or else inwards: the
+    nearer a surface, the more of its places are looked at. If |B| is smaller at the distance
     ``near`` already, the point is None.
     """
-    largest = _largest(field, surface, distances)
-    while largest[-1][0] > limit_T:
-        distances = distances[-1] * np.array([1.0, 2.0, 4.0])
-        largest = _largest(field, surface, distances)
-    if largest[0][0] <= limit_T:
-        distances = np.geomspace(near, distances[0], 5)
-        largest = _largest(field, surface, distances)
-    if largest[0][0] <= limit_T:
-        return near, None
-    last = max(number for number, (size, _) in enumerate(largest) if size > limit_T)
-    middle, place = distances[last], largest[last][1]
+    inwards = [*np.geomspace(near, distances[0], 5).tolist(), *distances[1:].tolist()]
+    middle = inwards.pop()
+    size, place = _largest(field, surface, middle)
+    is_beyond = size > limit_T
+    while size <= limit_T:
+        if not inwards:
+            return near, None
+        middle = inwards.pop()
+        size, place = _largest(field, surface, middle)
+    while is_beyond and (farther := _largest(field, surface, 2 * middle))[0] > limit_T:
+        middle, place = 2 * middle, farther[1]
+    farthest = surface(middle, place[None])[0]
     # along the line through that place the field is a power of the distance, nearly; farther out
     # the largest |B| may be elsewhere
     for _ in range(12):
@@ -248,47 +250,41 @@ def _farthest(
         line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
         falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
         distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
-        farthest = surface(distance, place[None])[0]
-        ((size, place),) = _largest(field, surface, np.array([distance]))
+        if distance <= middle:  # where coarse elements of iron make the field rough
+            break
+        middle, farthest = distance, surface(distance, place[None])[0]
+        size, place = _largest(field, surface, distance)
         if size <= 1.0001 * limit_T:
             break
-        middle = distance
-    return distance, farthest
+    return middle, farthest
 
 
-def _largest(field: Field, surface: Surface, distances: Floats) -> list[tuple[float, Floats]]:
-    """Return the largest |B| in T at each distance, and its place."""
-    starts, steps, of = [], [], []
+def _largest(field: Field, surface: Surface, distance: float) -> tuple[float, Floats]:
+    """Return the largest |B| in T at a distance, and its place (2,)."""
     # limits of the number of places about the axis and along the other direction at which the
     # largest |B| of a surface is looked for. They lie as far apart as the surface is from the
     # magnet: finer patterns of the field have decayed there. Near a large magnet they are farther
     # apart; there it is looked for about the best place of every row.
     fewest, most = 16, 64
-    for number, distance in enumerate(distances):
-        (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
-        out = float(np.hypot(x, y))
-        needed = np.array([2 * np.pi * out, 2 * max(abs(z), out)]) / distance
-        angles, rows = np.clip(needed, fewest, most).astype(int).tolist()
-        places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
-                                      np.linspace(-1, 1, rows)), axis=-1)
-        size = np.linalg.norm(field(surface(distance, places.reshape(-1, 2))), axis=1)
-        best = size.reshape(rows, angles).argmax(axis=1)
-        chosen = np.arange(rows) if (needed > most).any() else [int(size.argmax()) // angles]
-        starts.append(places[chosen, best[chosen]])
-        steps += len(chosen) * [np.array([2 * np.pi / angles, 2 / (rows - 1)])]
-        of += len(chosen) * [number]
-    place, step, owner = np.vstack(starts), np.array(steps), np.array(of)
+    (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
+    out = float(np.hypot(x, y))
+    needed = np.array([2 * np.pi * out, 2 * max(abs(z), out)]) / distance
+    angles, rows = np.clip(needed, fewest, most).astype(int).tolist()
+    places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
+                                  np.linspace(-1, 1, rows)), axis=-1)
+    size = np.linalg.norm(field(surface(distance, places.reshape(-1, 2))), axis=1)
+    best = size.reshape(rows, angles).argmax(axis=1)
+    chosen = np.arange(rows) if (needed > most).any() else [int(size.argmax()) // angles]
+    place, step = places[chosen, best[chosen]], np.array([2 * np.pi / angles, 2 / (rows - 1)])
     around = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 5)]), axis=-1).reshape(-1, 2)
     for _ in range(5):
-        tried = place[:, None] + step[:, None] * around
+        tried = place[:, None] + step * around
         tried[..., 1] = np.clip(tried[..., 1], -1, 1)
-        size = np.linalg.norm(field(surface(
-            np.repeat(distances[owner], len(around)), tried.reshape(-1, 2))), axis=1)
-        size = size.reshape(len(owner), -1)
-        place, step = tried[np.arange(len(owner)), size.argmax(axis=1)], step / 2
-    found = [np.flatnonzero(owner == number) for number in range(len(distances))]
-    best = [own[size[own].max(axis=1).argmax()] for own in found]
-    return [(float(size[one].max()), place[one]) for one in best]
+        size = np.linalg.norm(field(surface(distance, tried.reshape(-1, 2))), axis=1)
+        size = size.reshape(len(place), -1)
+        place, step = tried[np.arange(len(place)), size.argmax(axis=1)], step / 2
+    best = int(size.max(axis=1).argmax())
+    return float(size.max()), place[best]
 
 
 def _sd(

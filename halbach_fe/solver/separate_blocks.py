@@ -138,9 +138,10 @@ def solve_separate(
     own = _Blocks.of(magnet, 2 if estimate else 1)
     if not magnet.iron:
         return _reaction_without_iron(own)
-    if magnet.iron_is_axisymmetric:
-        return _reaction_with_iron(magnet, own, session, estimate)
-    key = own, magnet.external, key_of(magnet, session, 1.0)
+    key: tuple[object, ...] = own, magnet.external, key_of(magnet, session, 1.0)
+    if magnet.iron_is_axisymmetric:  # whose mesh follows from the bodies
+        study = magnet.study
+        key = own, study.iron_ring, study.iron, magnet.array_half_length, session.getdp
     return _latest(Asked(key, partial(_reaction_with_iron, magnet, own, session, estimate)))
 
 

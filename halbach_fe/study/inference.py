@@ -323,6 +323,8 @@ def _check_number(study: Study, name: str) -> None:
         near = [] if step in known else difflib.get_close_matches(
             str(step), [key for key in known if isinstance(key, str)], 1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
+        if known and isinstance(step, int) and step not in known:
+            hint = f"; its elements are [1] to [{len(known)}]"
         value = known.get(step)
         if value is None:
             break

@@ -193,7 +193,8 @@ class Demagnetization(StudyModel):
     The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
     """
 
-    intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=1e4, le=1e7)]
+    # of AlNiCo at least 38e3 A/m; numbers of NdFeB in oersted end at 36e3
+    intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=3.6e4, le=5e6)]
     squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     remanence_coefficient_per_K: RemanenceCoefficient
     coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
@@ -216,6 +217,13 @@ class Demagnetization(StudyModel):
                 "coercivity rise with the temperature, as that of ferrite alone does, but "
                 f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is not that of "
                 "ferrite; other magnets have a negative one")
+        if self.remanence_coefficient_per_K < ferrite_per_k and self.worst_when_cold and (
+                self.coercivity_coefficient_per_K <= RISING_PER_K):
+            raise ValueError(
+                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is that of "
+                "ferrite, whose coercivity rises with the temperature, but "
+                f"coercivity_coefficient_per_K is {self.coercivity_coefficient_per_K}; are the two "
+                "exchanged?")
         for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
                                   ("coercivity", self.coercivity_coefficient_per_K)):
             if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
@@ -224,3 +232,11 @@ class Demagnetization(StudyModel):
                                  "kelvin, not per cent, and a temperature in °C, not in kelvin, "
                                  "that the linear law holds for")
         return self
+
+    @property
+    def worst_when_cold(self) -> bool:
+        """Whether the coercivity falls less with the temperature than the field that opposes it.
+
+        That field is proportional to the remanence. The coercivity of ferrite even rises.
+        """
+        return self.coercivity_coefficient_per_K > self.remanence_coefficient_per_K

@@ -133,7 +133,7 @@ def _doubted_units(study: Study) -> list[str]:
             largest = np.ptp(np.array(body.triangles_m).reshape(-1, 3), axis=0).max()
             if largest < small_iron_m:
                 found.append(f"`iron.bodies[{number}]` is only {1e3 * largest:.3g} mm large. Were "
-                             "metres meant? Then set its unit_m = 1.")
+                             "metres or inches meant? Then set its unit_m to 1 or 0.0254.")
     found += _doubted_curves(study)
     found += (f"`array{key}`: {doubt}" for key, one in (
         ("", study.array), *((f".ring[{number}]", ring)

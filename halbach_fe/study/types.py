@@ -92,13 +92,16 @@ KILOOERSTED = 1e6 / (4 * math.pi)
 WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
     ("coercivity_A_per_m", "kilooersted", KILOOERSTED),
-    ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
+    ("_A_per_m", "kiloamperes per metre", 1e3),
+    ("coercivity_A_per_m", "oersted", 1e-3 * KILOOERSTED), ("_m", "millimetres", 1e-3),
     ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
     ("_A_m2", "A mm²", 1e-6), ("_rad", "degrees", math.pi / 180),
     ("coefficient_per_K", "per cent per kelvin", 1e-2),
     ("coefficient_per_K", "the other sign", -1.0),
     ("coefficient_per_K", "per cent per kelvin and with the other sign", -1e-2),
-    *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
+    *((key, "per cent", 1e-2) for key in (
+        "squareness", "gain", "magnitude_sd", "common_mode_sd", "strength_sd", "common_sd",
+        "variation_sd")),
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
 """
@@ -117,8 +120,7 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     """
     # Largest temperature coefficient of any material: what is larger is in per cent.
     most_per_k = 0.02
-    # Largest intrinsic coercivity of magnets in kOe: a larger number is in kA/m.
-    most_kilooersted = 45.0
+    most_coercivity = 45.0 * KILOOERSTED  # of any magnet, in A/m: in kOe, kA/m or Oe it is less
     least_square = 0.3  # smallest squareness of a magnet
     max_wrong_unit = 1e12  # values from this size on are not explained by a wrong unit
     key = re.sub(r"(\[\d+\])+$", "", key)  # of lists in tables of a list
@@ -130,9 +132,9 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     for suffix, unit, factor in WRONG_UNITS:
         if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > most_per_k):
             continue
-        if factor == KILOOERSTED and value > most_kilooersted:
-            continue
         given = value * factor + (ABSOLUTE_ZERO_C if unit == "kelvin" else 0.0)
+        if key.endswith("coercivity_A_per_m") and given > most_coercivity:
+            continue
         if factor < 0 and value < 0:  # no sign was lost
             continue
         if key.endswith("squareness") and given < least_square:

@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+import threading
 
-from halbach_fe.core.threads import Compiled, compiled
+import pytest
+
+from halbach_fe.core.threads import Compiled, compiled, in_threads, share_out
 
 
 @compiled
@@ -29,3 +32,13 @@ def test_numba_is_imported_with_the_first_call():
             "before = 'numba' in sys.modules; kernels.apart(np.ones(3), np.zeros(3)); "
             "sys.exit([before, 'numba' in sys.modules] != [False, True])")
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_one_thread_is_that_of_the_caller(monkeypatch, threads):
+    """With two, the control, all of the work is done by others."""
+    monkeypatch.setenv("NUMBA_NUM_THREADS", str(threads))
+    shares, seen = share_out(100), []
+    in_threads(lambda first, last: seen.append((first, last, threading.get_ident())), shares)
+    assert sorted(part[:2] for part in seen) == shares
+    assert {who == threading.get_ident() for *_, who in seen} == {threads == 1}

@@ -410,12 +410,17 @@ def test_no_limit_where_nothing_falls(dipole, session):
     assert demagnetization_summary(found)["limit_temperature_C"]["0.0"] is None
 
 
+@pytest.mark.parametrize("coefficients", [(-2e-3, 3.5e-3), (-1.2e-3, 0.0), (-1.2e-3, -1e-3)])
 @pytest.mark.parametrize("share", [0.0, 0.01])
-def test_ferrite_passes_the_knee_in_the_cold(dipole, session, share):
-    """Its coercivity rises with the temperature: below the limit more of it is past the knee."""
+def test_ferrite_passes_the_knee_in_the_cold(dipole, session, share, coefficients):
+    """Its coercivity rises with the temperature: below the limit more of it is past the knee.
+
+    So it is wherever the coercivity falls less than the remanence, and with it the field.
+    """
+    of_remanence, of_coercivity = coefficients
     found = demagnetization_map(build_magnet(dipole(array__remanence_T=0.4, demagnetization={
-        "intrinsic_coercivity_A_per_m": 260e3, "remanence_coefficient_per_K": -2e-3,
-        "coercivity_coefficient_per_K": 3.5e-3})), session)
+        "intrinsic_coercivity_A_per_m": 260e3, "remanence_coefficient_per_K": of_remanence,
+        "coercivity_coefficient_per_K": of_coercivity})), session)
     limit = found.limit_temperature(share)
     below, above = found.share_beyond(np.array([limit - 0.01, limit + 0.01]))
     assert above <= share < below
@@ -463,7 +468,7 @@ def test_no_temperature_is_below_absolute_zero(dipole, session):
 
 def test_what_is_past_the_knee_anyway_is_not_said_to_pass_it_never(dipole, session):
     found = demagnetization_map(build_magnet(dipole(demagnetization=COLD | {
-        "intrinsic_coercivity_A_per_m": 12e3})), session)
+        "intrinsic_coercivity_A_per_m": 4e4})), session)
     assert found.limit_temperature(0.0) == -np.inf
     assert "the first cell is past the knee at every temperature" in answer(found).said
 

@@ -178,6 +178,25 @@ def test_what_the_study_says_of_its_blocks_is_not_of_the_shims(measured, tmp_pat
     assert of_grade.materials == (None,) * (len(of_grade.blocks) - count) + ("N42",) * count
 
 
+def test_the_tray_is_filled_for_neighbours_as_they_were_found(tmp_path):
+    """Blocks of a neighbour that an update has found a quarter stronger call for the tray of a
+    neighbour of that factor. It was filled for the nominal one, which is the control.
+    """
+    study = tray(rings=[{"radius_m": 0.08, "count": 8, "z_m": [-0.09, 0.0, 0.09]}])
+    nominal = build_magnet(study).nominal_magnetization
+    exact = np.zeros((len(nominal), 1))
+    found = []
+    for factor, deviation in ((1.0, 0.25), (1.25, 0.0), (1.0, 0.0)):
+        magnet = build_magnet(study.with_(external={
+            "neighbours": [{"z_m": 0.41, "factor": factor}]}))
+        posterior = Gaussian(nominal, exact, Gaussian(deviation * nominal, exact))
+        found.append(shim_tray(magnet, Session.open(tmp_path / str(len(found))), posterior, REGION))
+    one, same, control = found
+    assert one.filled == same.filled
+    assert one.after.rms_ppm == pytest.approx(same.after.rms_ppm, rel=1e-9)
+    assert one.filled != control.filled
+
+
 def test_shims_next_to_the_region(tmp_path):
     """Cubes of 3 mm that are 1 mm off it, beside magpylib's field at evenly spread points."""
     region, generator = Region.sphere(0.022), np.random.default_rng(6)

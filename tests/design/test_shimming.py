@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import permutations, product
 
+import magpylib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import halbach_fe as hf
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.remounting import mounts_of, remounted, rotation_deg, shape_turns
 from halbach_fe.design.shimming import gain, shim, taken_out
@@ -20,6 +22,7 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.shimming import answer
 from halbach_fe.report.words import faults_in_words
+from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import MultipoleReference, Multipoles, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -209,6 +212,57 @@ def test_blocks_are_taken_out_after_two_updates_as_after_one(session):
     sd = np.linalg.norm(loose, axis=1)
     np.testing.assert_allclose(np.linalg.norm(other, axis=1), sd, rtol=1e-6)
     np.testing.assert_allclose(same, mean, atol=1e-3 * sd.min())
+
+
+OBJECT_M = (0.3, 0.06, 0.0)
+
+
+@pytest.mark.parametrize("region", [None, {"sphere_m": 0.03}], ids=["multipoles", "homogeneity"])
+def test_an_object_that_an_update_found_is_there_when_blocks_are_moved(session, region):
+    """Of a magnet beside magpylib's dipole, whose moment is uncertain, what is to be shimmed is the
+    field of both, before and after the moves. It was that of the blocks, 124 bars off (rms).
+    """
+    moment = np.array([300.0, 150.0, 0.0])
+    study = study_of(
+        dimension=3, array__rings=2, array__ring_length_m=0.05, array__blocks_per_ring=8,
+        prior={"magnitude_sd": 0.01, "direction_sd_deg": 1e-3}, homogeneity=region,
+        observation__positions={"kind": "circles", "radius_m": RADIUS, "angles": 16,
+                                "z_min_m": -0.06, "z_max_m": 0.06, "count": 5},
+        external={"dipoles": [{"position_m": OBJECT_M, "moment_A_m2": [0.0, 0.0, 0.0]}]},
+        uncertain=[{"name": f"object.{axis}_A_m2", "sd": 300.0, "change": {
+            f"external.dipoles[1].moment_A_m2[{number}]": 1.0}}
+            for number, axis in enumerate("xyz", start=1)])
+    bodies = draw_magnet(study, magnet_of(study), np.random.default_rng(1)).mounted.bodies
+
+    def field(bodies, points):
+        return vacuum_field(bodies, points) + magpylib.misc.Dipole(
+            moment=moment, position=OBJECT_M).getB(points)
+
+    points, generator = points_from(study.observation.positions), np.random.default_rng(2)
+    data = field_map(points, field(bodies, points) + 2e-5 * generator.standard_normal(points.shape))
+    update = infer(build_magnet(study), data, session)
+    reference = None if region else MultipoleReference(RADIUS, ORDERS, 0.0)
+    found = hf.shim(update, session.within("shim"), reference, swaps=2, turns=0)
+    assert found.steps
+    moved_bodies, model = moved(bodies, bodies, found, Rotation.identity), found.model
+    if region is None:
+        angle = 2 * np.pi * np.arange(64) / 64
+        radial = np.column_stack([
+            np.cos(angle + model.turn), np.sin(angle + model.turn), 0 * angle])
+        for known, some in ((found.before, bodies), (found.after, moved_bodies)):
+            shown = np.sum(field(some, RADIUS * radial) * radial, axis=1)
+            true = model.units(2j / 64 * np.exp(-1j * np.outer((1, *ORDERS), angle)) @ shown)
+            # of 8 numbers, which have an rms above 2 with a probability of 1e-4
+            assert np.sqrt(np.mean(((known.mean - true) / known.sd)**2)) < 2
+    else:
+        sampling = model.homogeneity.sampling
+        for known, some in zip(found.fields, (bodies, moved_bodies), strict=True):
+            size = np.linalg.norm(field(some, sampling.points), axis=1)
+            mean = sampling.weights @ size
+            assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T)
+            assert known.rms_ppm == pytest.approx(PPM * np.sqrt(
+                sampling.weights @ (size / mean - 1)**2), rel=0.01)
+    assert found.shimmed_study.uncertain == study.uncertain
 
 
 def test_gains_are_those_of_samples(generator):

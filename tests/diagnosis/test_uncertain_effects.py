@@ -376,6 +376,7 @@ def test_a_study_at_an_amplitude_of_zero_has_the_numbers_that_change_with_it(eff
     ({"array.remanance_T": 1.0}, "number with a fraction .* did you mean 'remanence_T'"),
     ({"instrument.gain": 1.0}, r"it has 3 of them, the first of which is 'instrument.gain\[1\]'"),
     ({"noise.position_sd_m[1]": 1.0}, "which no update estimates"),
+    ({"instrument.gain[0]": 1.0}, r"its elements are \[1\] to \[3\]"),
     ({"array.rings": 1.0}, "which must be a number with a fraction"),
     ({"array.exceptions[2].twist_deg": 1.0}, "which must be a number with a fraction"),
     ({"array.remanence_T": 0.0}, "'a' changes all its numbers by 0"),

@@ -407,7 +407,7 @@ def test_stl_files(tmp_path, change, sentence):
         assert body.measures[0] == pytest.approx(0.1 * 0.2 * 0.04)
         text = study.read_text()
         study.write_text(text.replace('"body.stl"', '"body.stl"\nunit_m = 1e-6'))
-        with pytest.warns(HalbachWarning, match=r"only 0\.2 mm large\. Were metres meant"):
+        with pytest.warns(HalbachWarning, match=r"only 0\.2 mm large\. Were metres or inches"):
             read_study(study)
         return
     with pytest.raises(StudyError, match=sentence):

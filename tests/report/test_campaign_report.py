@@ -435,6 +435,16 @@ def test_the_study_of_register_is_said_in_words(home):
     assert said.count(" instead of ") == 3
     assert said.endswith(" and 1 more.")
     assert "instrument." not in said
+    # of several maps, register's page of each is of a study of that map alone, with its own tables
+    table = {"excluded_readings": [1, 2]}
+    maps = [{"name": "low", "file": "map.csv", "instrument": found["instrument"],
+             "inference": table}, {"name": "high", "file": "high.csv"}]
+    results(home / "of-low", "register", another(**found, inference=table),
+            [home / "study.toml", home / "map.csv"], ["study.registered.toml"])
+    results(home / "of-both", "infer", another(maps=maps),
+            [home / "of-low" / "study.registered.toml", home / "map.csv"])
+    said, = found_in(home, "of-low", "of-both").versions
+    assert said.endswith("; nothing else differs.")
     # a control: the same numbers from a diagnosis are named
     results(home / "diagnosed", "diagnose", reads=[home / "study.toml"],
             files=["study.diagnosed.toml"])

@@ -13,7 +13,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_title
 from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.magnetic_axis import magnetic_axis
-from halbach_fe.response.stray_field import NEAREST, stray_field
+from halbach_fe.response.stray_field import DISTANCES, NEAREST, _farthest, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
@@ -203,6 +203,29 @@ def test_coils_are_no_part_of_the_magnet_beside_iron(tmp_path):
     assert stray_title(beside) == "Outside of the magnet, without coils"  # in the terminal too
     assert "coils besides" in str(sections_of_stray(beside)[0].parts)
     assert abs(bare.axial.distance_m / alone.axial.distance_m - 1) > 0.01
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.1])
+def test_the_line_where_a_coarse_mesh_makes_the_field_rough(roughness):
+    """Of all places that are looked at none farther out is above the limit. The search went to and
+    fro, up to 12 times, and may have ended on its way back. The control is a smooth field.
+    """
+    looked = []
+
+    def field(points):
+        radius, angle = np.hypot(*points.T[:2]), np.arctan2(*points.T[1::-1])
+        size = 1e-3 * radius**-3 * (1 + roughness * np.sin(300 * radius + 3 * angle))
+        looked.extend(zip(radius, size, strict=True))
+        return size[:, None] * [0.0, 0.0, 1.0]
+
+    def around(distance, place):
+        return np.column_stack([distance * np.cos(place[:, 0]), distance * np.sin(place[:, 0]),
+                                place[:, 1]])
+
+    found, _ = _farthest(field, around, NEAREST, DISTANCES, 5e-4)
+    assert max(radius for radius, size in looked if size > 5.001e-4) < 1.001 * found
+    assert found == pytest.approx(2**(1 / 3), rel=0.5 * roughness + 1e-4)
+    assert min(looked)[0] > 0.9  # the line is not looked for nearer to the magnet
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.035])

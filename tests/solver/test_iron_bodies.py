@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gmsh
 import meshio
@@ -486,6 +487,27 @@ def test_the_solution_serves_the_stray_field(session, coarse_mesh, monkeypatch):
     there = stray_field(outside, session).radial.distance_m
     assert there == pytest.approx(found.radial.distance_m, rel=1e-6)
     assert len(solved) > once
+
+
+def test_the_solution_of_a_tube_serves_the_stray_field(session, monkeypatch):
+    """It was solved once more for the line. Iron of another permeability, of another length, and
+    other blocks are the controls.
+    """
+    solved = []
+    monkeypatch.setattr(separate_blocks, "_solve_iron",
+                        lambda *given, **_: solved.append(given) or SimpleNamespace(
+                            field=lambda points: 0 * points))
+    tube = {"kind": "tube", "inner_radius_m": 0.06, "outer_radius_m": 0.07, "length_m": 0.03}
+    magnet = build_magnet(study_with(tube))
+    solve_separate(magnet, session)
+    stray_field(magnet, session)
+    assert len(solved) == 1
+    for count, other in enumerate((
+            study_with(tube, iron={"relative_permeability": 900.0}),
+            study_with(tube | {"length_m": 0.031}),
+            magnet.study.with_(array__free_blocks__remanence_T=[1.4])), start=2):
+        solve_separate(build_magnet(other), session)
+        assert len(solved) == count
 
 
 def test_the_key_of_finer_iron_is_named():
