@@ -63,7 +63,7 @@ DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change pl
 def _summary(shim: Shim) -> Plain:
     """Return the content of shim.json."""
     return {
-        "study": shim.study.name, **values_summary(shim.model, shim.limit, dict(zip(
+        "study": shim.study.name, **aim_of(shim.model).summary(shim.limit, dict(zip(
             ("before", "after"), shim.fields or (shim.before, shim.after), strict=True))),
         "moves": [_step_summary(shim, step) for step in shim.steps],
         "stop": shim.stop, "moves_there_are": shim.tried,
@@ -81,6 +81,9 @@ class Aim(NamedTuple):
 
     what: str
     """Subject and verb of what is made small."""
+    values: str
+    squares: str
+    """The same as a noun, and its sum of squares."""
     unit: str
     """The unit of a value in names of JSON files."""
     rms_unit: str
@@ -88,50 +91,48 @@ class Aim(NamedTuple):
     title: str
     """Title of the table of the values."""
     axis: str
-    """Name of their rms in figures."""
+    label: str
+    """Name of their rms in figures of orders and of moves."""
     table: str
     """Kind of the table, see `Table`."""
-    size: Callable[[float], str]
-    """Text of an rms."""
     verb: str
     """The command that shows the values."""
+    size: Callable[[float], str]
+    """Text of an rms."""
+    within: Callable[[float], str]
+    """What a limit asks for, in words."""
+    reference: Callable[[float | None], Plain]
+    plain: Callable[[Any], Plain]
+    """What the values of all magnets refer to, with a limit, and those of one, in a JSON file."""
+    rows: Callable[[Mapping[str, Any]], Rows]
+    """Rows of text with the values of magnets by name."""
+
+    def summary(self, limit: float | None, values: Mapping[str, Any]) -> Plain:
+        """Return the values of magnets by name, and what they refer to, for a JSON file."""
+        return {**self.reference(limit), **{name: self.plain(each)
+                                            for name, each in values.items()}}
 
 
 def aim_of(model: MultipoleModel | DeviationModel) -> Aim:
     """Return what a model is of."""
     if isinstance(model, DeviationModel):
-        region = model.homogeneity.region.text
-        return Aim(f"the deviation of |B| in {region} is", "ppm", "ppm rms",
-                   f"Deviations of |B| in {region}", "the deviation of |B| in ppm", "turned", ppm,
-                   "homogeneity")
-    return Aim("the unwanted multipoles are", "units", "units of 1e-4 rms",
-               "Multipoles in units of 1e-4", "the unwanted multipoles in units of 1e-4", "numbers",
-               "{:.3g}".format, "multipoles")
-
-
-def within_limit(model: MultipoleModel | DeviationModel, limit: float) -> str:
-    """Return what a limit asks for, in words."""
-    return (f"The deviation is within {ppm(limit)} ppm rms" if isinstance(model, DeviationModel)
-            else f"All unwanted multipoles are within {limit:g} units")
-
-
-def values_summary(
-    model: MultipoleModel | DeviationModel, limit: float | None, values: Mapping[str, Any],
-) -> Plain:
-    """Return multipoles or fields by name, and what they refer to, as entries of a JSON file."""
-    if isinstance(model, DeviationModel):
-        return {"region": asdict(model.homogeneity.region), "limit_ppm": limit,
-                **{name: plain_homogeneity(each) for name, each in values.items()}}
-    return {"reference": reference_summary(model, limit),
-            **{name: plain(each, model.unit) for name, each in values.items()}}
-
-
-def values_table(
-    model: MultipoleModel | DeviationModel, values: Mapping[str, Any]
-) -> Rows:
-    """Return rows of text with multipoles or fields by name."""
-    return (homogeneity_rows(values) if isinstance(model, DeviationModel)
-            else text_table(**values))
+        region = model.homogeneity.region
+        return Aim(
+            f"the deviation of |B| in {region.text} is", "the deviation of |B|",
+            "the mean square deviation of |B|", "ppm", "ppm rms",
+            f"Deviations of |B| in {region.text}", "the deviation of |B| in ppm",
+            "rms deviation of |B| in ppm", "turned", "homogeneity", ppm,
+            lambda limit: f"The deviation is within {ppm(limit)} ppm rms",
+            lambda limit: {"region": asdict(region), "limit_ppm": limit}, plain_homogeneity,
+            homogeneity_rows)
+    return Aim(
+        "the unwanted multipoles are", "the unwanted multipoles", "the sum of all |c_n|²", "units",
+        "units of 1e-4 rms", "Multipoles in units of 1e-4",
+        "the unwanted multipoles in units of 1e-4", "rms of |c$_n$| in units of 1e-4", "numbers",
+        "multipoles", "{:.3g}".format,
+        lambda limit: f"All unwanted multipoles are within {limit:g} units",
+        lambda limit: {"reference": reference_summary(model, limit)},
+        lambda known: plain(known, model.unit), lambda values: text_table(**values))
 
 
 def _reason_against(shim: Shim) -> str:
@@ -260,7 +261,7 @@ def answer(shim: Shim) -> Answer:
                 + f"{what} {before} {unit}, including the uncertainty{_unknown_part(shim)}.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
-        said += f" {within_limit(shim.model, shim.limit)} with a probability of {first}"
+        said += f" {aim.within(shim.limit)} with a probability of {first}"
         said += f" before and {last} after." if shim.steps else "."
         if shim.steps and shim.within[1] < LIKELY:
             said += " These moves do not reach that limit."
@@ -367,10 +368,9 @@ def page(shim: Shim) -> Page:
     against = _reason_against(shim)
     move_title = "Moves that would be made" if against else "Moves"
     aim, moves = aim_of(shim.model), _move_table(shim)
-    rows = values_table(shim.model, _compared(shim, *(shim.fields or (shim.before, shim.after))))
+    rows = aim.rows(_compared(shim, *(shim.fields or (shim.before, shim.after))))
     sections = [Section([_convention(shim), Table(rows, aim.table), linearized(shim.study)],
                         aim.title)]
-    values = "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
     figures = {} if shim.fields else {"shim_multipoles.png": (
         partial(multipole_figure, _compared(shim, shim.before, shim.after), shim.limit),
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
@@ -382,7 +382,7 @@ def page(shim: Shim) -> Page:
             "shim_moves.png": (
                 partial(_moves_figure, shim), f"{move_title}, with their numbers in the table"),
             "shim_gain.png": (
-                partial(_gain_figure, shim), f"Root mean square of {values} after each "
+                partial(_gain_figure, shim), f"Root mean square of {aim.values} after each "
                 "move, including the uncertainty")}
     shimmed, note = shim.shimmed_study, f"shimmed: {len(shim.steps)} moves"
     return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
@@ -393,11 +393,9 @@ def page(shim: Shim) -> Page:
 def _of_the_moves(shim: Shim) -> str:
     """Say in which order the moves are listed, and what their gain is."""
     mounting = shim.study.prior.mounting_sd_deg
-    squares = ("the sum of all |c_n|²" if shim.fields is None else
-               "the mean square deviation of |B|")
     return (
         "The moves are listed in the order in which they were chosen; the gain is the expected "
-        f"decrease of {squares}, in units "
+        f"decrease of {aim_of(shim.model).squares}, in units "
         "of its own standard deviation (sd). The list ends before moves of less than 1; of those "
         "with 1, one in six turns out to gain nothing, of those with 2, one in forty. " + (
             "The rms after each is linearized about the field as it is; that of the table of the "
@@ -472,7 +470,6 @@ def _gain_figure(shim: Shim) -> Figure:
     figure, axis = chart(3.4)
     sizes = _sizes_by_move(shim)
     axis.plot(sizes, "-o", color=POSTERIOR)
-    axis.set(xlabel="moves", ylim=(0, 1.08 * max(sizes)), ylabel="rms of |c$_n$| in units of 1e-4"
-             if shim.fields is None else "rms deviation of |B| in ppm")
+    axis.set(xlabel="moves", ylim=(0, 1.08 * max(sizes)), ylabel=aim_of(shim.model).label)
     axis.set_xticks(range(len(sizes)))
     return figure

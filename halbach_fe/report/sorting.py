@@ -41,14 +41,7 @@ from halbach_fe.report.page import (
     csv_file,
     legend_above,
 )
-from halbach_fe.report.shimming import (
-    LIKELY,
-    LITTLE,
-    aim_of,
-    values_summary,
-    values_table,
-    within_limit,
-)
+from halbach_fe.report.shimming import LIKELY, LITTLE, aim_of
 from halbach_fe.report.words import counted, in_a_row, ppm, probability
 
 T = TypeVar("T")
@@ -62,7 +55,7 @@ def _summary(found: SortedBlocks) -> Plain:
     """Return the content of sort.json; rms values are those of the mean."""
     unit = aim_of(found.model).unit
     return {
-        "study": found.study.name, **values_summary(found.model, found.limit, dict(zip(
+        "study": found.study.name, **aim_of(found.model).summary(found.limit, dict(zip(
             ("sorted", "unsorted"), found.fields or (found.best, found.numbered), strict=True))),
         "blocks": len(found.table), "left_over": found.left_over,
         "table_order": found.own_order, "turned": [
@@ -92,7 +85,8 @@ def _limit(found: SortedBlocks) -> str:
     share = _within(found)
     if share is None or found.limit is None:
         return ""
-    return (f" {within_limit(found.model, found.limit)} with a probability of {probability(share)}."
+    return (f" {aim_of(found.model).within(found.limit)} with a probability of "
+            f"{probability(share)}."
             f"{' Sorting does not reach that limit.' if share < LIKELY else ''}")
 
 
@@ -127,7 +121,7 @@ def place_table(found: SortedBlocks) -> Rows:
 
 def order_table(found: SortedBlocks) -> Rows:
     """Return the rows of the table of multipoles or fields, as text."""
-    return values_table(found.model, _compared(
+    return aim_of(found.model).rows(_compared(
         found, *(found.fields or (found.best, found.numbered))))
 
 

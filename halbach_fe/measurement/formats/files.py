@@ -30,23 +30,21 @@ from halbach_fe.measurement.field_map import (
     warn_of_left_out,
     warn_of_millimetres,
 )
-from halbach_fe.measurement.formats import (
-    bdsim,
-    comsol,
-    delimited_table,
-    g4beamline,
-    openpmd,
-    opera,
-    paraview,
-)
+from halbach_fe.measurement.formats import comsol, delimited_table, g4beamline, openpmd, paraview
 from halbach_fe.measurement.formats.conversion import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import (
     Grid,
+    bdsim_lines,
+    geant4_lines,
     grid_of,
+    is_bdsim,
     is_fluka,
+    is_opera,
     is_srw,
+    read_bdsim,
     read_fluka,
+    read_opera,
     read_srw,
 )
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
@@ -54,17 +52,17 @@ from halbach_fe.measurement.tables import Line, csv_table, finite, lines_of, tex
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
-    FORMATS, (delimited_table.read, opera.read, comsol.read, openpmd.read, g4beamline.read,
-              bdsim.read, read_srw, read_fluka, paraview.read), strict=True))
+    FORMATS, (delimited_table.read, read_opera, comsol.read, openpmd.read, g4beamline.read,
+              read_bdsim, read_srw, read_fluka, paraview.read), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 RECOGNIZED: dict[str, Callable[[Sequence[Line]], bool]] = {
-    "comsol": comsol.is_comsol, "g4beamline": g4beamline.is_g4beamline, "bdsim": bdsim.is_bdsim,
-    "srw": is_srw, "fluka": is_fluka, "opera": opera.is_opera}
+    "comsol": comsol.is_comsol, "g4beamline": g4beamline.is_g4beamline, "bdsim": is_bdsim,
+    "srw": is_srw, "fluka": is_fluka, "opera": is_opera}
 """Whether the first lines of a file are of a format."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
-    "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim.lines(grid)),
-    "geant4": lambda grid: _joined(opera.lines(grid))}
+    "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim_lines(grid)),
+    "geant4": lambda grid: _joined(geant4_lines(grid))}
 """Writers of the formats that need a regular grid."""
 SUFFIXES = {"csv": (".csv",), "vtu": (".vtu",), "openpmd": (".h5", ".hdf5")}
 """Suffixes of the formats that have a usual one."""

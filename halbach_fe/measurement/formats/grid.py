@@ -1,7 +1,7 @@
 """Regular grids of points: those that export formats need, and those that a header describes.
 
-Rows of the latter have no positions. Of SRW, ten comments above the columns Bx, By and Bz in m and
-T, where x changes fastest::
+**SRW and FLUKA.** Rows have no positions. Of SRW, ten comments above the columns Bx, By and Bz in m
+and T, where x changes fastest::
 
     #Bx [T], By [T], Bz [T] on 3D mesh: inmost loop vs X ..., outmost loop vs Z ...
     #-0.01 #initial X position [m]
@@ -19,13 +19,38 @@ data, where x changes fastest; columns are 10 characters wide, or separated by c
 
 Sources: files that SRW writes and others write for it (uti_io of srwpy), and FLUKA's cards as
 NA60+ reads them.
+
+**Opera.** Its TABLE command writes::
+
+     5 461 311 2                  three counts, of a grid along x, y and z, and a flag
+     1 X [METRE]                  a number, a name and a unit for each column
+     ...
+     6 BZ [TESLA]
+     0                            the end of the header; [METRE] here is the unit of all lengths
+     -0.55 -1.1 -0.01 0.5e-4 0.4e-5 -0.2e-2
+
+The first line may be blank. A list of points has its length three times in place of the counts.
+Units may be missing, or LENGU and FLUXU, which state no unit. Sources of the layout: the table of
+Geant4's example purging_magnet, and the tables that OPAL (tests of SBend3D) and musrSim (its
+manual) read.
+
+**Geant4.** Exports are for its PurgMagTabulatedField3D (.cc file of this class, and
+PurgMag3D.TABLE): in metres and tesla, with z that changes fastest. Its reader ends the header at
+the first line whose second character is 0, and reads lines into a buffer of 256 characters. It
+expects a seventh column, the permeability, but ignores it; the export writes that of vacuum. The
+units in the header are for other readers.
+
+**BDSIM** (``bdsim3d``). The file has keys ``nx> 5``, ``xmin> -2.0`` ..., a line
+``! X Y Z Fx Fy Fz``, and rows in cm and T. The x coordinate changes fastest, which is BDSIM's
+``loopOrder> xyzt``. BDSIM's loader takes the grid from the keys and assigns the values by the order
+of the rows. Source: BDSIM's manual, Field Map File Formats.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -34,9 +59,10 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of, refuse_total_field
+from halbach_fe.measurement.formats import delimited_table, names
 from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import CARTESIAN, in_units
+from halbach_fe.measurement.formats.names import CARTESIAN, ColumnName, in_units
 from halbach_fe.measurement.tables import (
     MAX_LINE,
     Line,
@@ -46,7 +72,9 @@ from halbach_fe.measurement.tables import (
     is_comment,
     lines_of,
     rows_of,
+    uncommented,
 )
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3
@@ -237,3 +265,172 @@ def _points(first: Floats, last: Floats, count: Floats, rows: int, where: str) -
 def points_on(axes: Sequence[Floats]) -> Floats:
     """Return the points (n, 3) of a grid from its coordinates along x, y, z; x changes fastest."""
     return np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1).reshape(-1, 3)
+
+
+COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
+COLUMN = re.compile(r"\s*([1-9]\d?)\s+([A-Za-z][^\s\[]*)\s*(?:\[([^\[\]]*)\])?\s*")
+END = re.compile(r"\s*0\s*(?:\[([^\[\]]*)\])?\s*")
+EXPORTED = (" 1 X [METRE]", " 2 Y [METRE]", " 3 Z [METRE]", " 4 BX [TESLA]", " 5 BY [TESLA]",
+            " 6 BZ [TESLA]", " 7 BMOD/HMOD", " 0 [METRE]")
+
+
+def is_opera(lines: Sequence[Line]) -> bool:
+    """Return whether the first lines are those of an Opera table."""
+    first = [line for _, line in lines[:2] if len(line) <= MAX_LINE]
+    return len(first) == 2 and bool(COUNTS.fullmatch(first[0])) and bool(COLUMN.fullmatch(first[1]))
+
+
+def read_opera(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read an Opera table; its points may come in any order.
+
+    Raises
+    ------
+    MeasurementError
+        If the header is not that of an Opera table, or states another number of points than follow.
+    """
+    lines = lines_of(raw, declared, where)
+    counts = COUNTS.fullmatch(lines[0][1][:MAX_LINE])
+    if not counts:
+        raise MeasurementError(must_be("first line", where, "the three counts of an Opera table",
+                                       f"'{lines[0][1].strip()[:40]}'"))
+    columns, length_unit, start = _opera_columns(lines, where)
+    values, texts = rows_of(lines[start:], len(columns), None, declared, where)
+    grid = [int(text) for text in counts.groups()[:3]]
+    listed = len(set(grid)) == 1 and len(values) == grid[0]
+    if len(values) != grid[0] * grid[1] * grid[2] and not listed:
+        raise MeasurementError(must_be(
+            "content", where, f"{grid[0]} x {grid[1]} x {grid[2]} points, as its first line says",
+            str(len(values)), "Is the file cut short?"))
+    return ForeignTable(columns, values, where, length_unit=length_unit, texts=texts)
+
+
+def _opera_columns(lines: Sequence[Line], where: str) -> tuple[tuple[ColumnName, ...], str, int]:
+    """Return the columns, the unit of all lengths, and the index of the first row."""
+    columns: list[ColumnName] = []
+    for index, (number, line) in enumerate(lines[1:], 1):
+        line = line[:MAX_LINE]
+        if end := END.fullmatch(line):
+            if not columns:
+                break
+            return tuple(columns), (end[1] or "").strip(), index + 1
+        column = COLUMN.fullmatch(line)
+        if not column or int(column[1]) != len(columns) + 1:
+            raise MeasurementError(must_be(
+                f"line {number}", where, f"column {len(columns) + 1} of the header (number, name, "
+                "[unit]), or its end, 0", f"'{line.strip()[:40]}'"))
+        name = names.parse(column[2])
+        columns.append(ColumnName(name.text, name.quantity, (column[3] or "").strip()))
+    raise MeasurementError(must_be("header", where, "columns and a line 0 after them",
+                                   "a header without them"))
+
+
+def geant4_lines(grid: Grid) -> Iterator[str]:
+    """Yield the lines of a file for Geant4."""
+    yield ""
+    nx, ny, nz = grid.shape
+    yield f" {nx} {ny} {nz} "  # without the last space the reader would parse the previous line
+    yield from EXPORTED
+    for row in grid.rows():
+        yield f"{row} {MU_0!r}"
+
+
+PER_M = 100.0
+"""Centimetres per metre."""
+KEY = re.compile(r"\s*(n[xyzt]|[xyzt](?:min|max)|loopOrder)>\s*(\S{1,30})\s*")
+BDSIM_NAMES = {"X": ("x", "cm"), "Y": ("y", "cm"), "Z": ("z", "cm"), "Fx": ("Bx", "T"),
+         "Fy": ("By", "T"), "Fz": ("Bz", "T")}
+NEAR = 0.01
+"""Largest distance of a column's coordinate from that of the keys, in steps of the grid: columns
+are printed with few digits."""
+
+
+def is_bdsim(lines: Sequence[Line]) -> bool:
+    """Return whether the first lines that are no comments are keys of BDSIM."""
+    first = [line[:MAX_LINE] for _, line in lines[:20] if not is_comment(line)]
+    return bool(first) and bool(KEY.fullmatch(first[0]))
+
+
+def read_bdsim(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read a map in cm and T, of one, two or three coordinates.
+
+    Raises
+    ------
+    MeasurementError
+        If the header names other columns, or another number of points than follow, or if the keys
+        describe another grid than the columns.
+    """
+    lines = lines_of(raw, declared, where)
+    keys = {found[1]: found[2] for _, line in lines if (found := KEY.fullmatch(line[:MAX_LINE]))}
+    rest = [line for line in lines if not KEY.fullmatch(line[1][:MAX_LINE])]
+    header = next((uncommented(line).split() for _, line in rest
+                   if line.lstrip().startswith("!")), [])
+    table = delimited_table.read_lines(rest, declared, where)
+    if not set(header) <= set(BDSIM_NAMES) or len(header) != table.values.shape[1]:
+        raise MeasurementError(must_be(
+            "header", where, "a line ! X Y Z Fx Fy Fz, of a field that does not change in time",
+            " ".join(header)[:60] or "none"))
+    try:
+        counts = [int(keys[name][:9]) for name in ("nx", "ny", "nz") if name in keys]
+        count = int(np.prod(counts)) if min(counts, default=1) > 0 else 0
+    except ValueError:
+        count = 0
+    if count != len(table.values):
+        raise MeasurementError(must_be("content", where, f"{count} points, as its keys say",
+                                       str(len(table.values)), "Is the file cut short?"))
+    columns_of_file = tuple(ColumnName(name, *BDSIM_NAMES[name]) for name in header)
+    remarks = _compare_grids(keys, header, table.values, where)
+    return replace(table, columns=columns_of_file, remarks=table.remarks + remarks)
+
+
+def _compare_grids(
+    keys: dict[str, str], header: Sequence[str], values: Floats, where: str
+) -> tuple[str, ...]:
+    """Compare the grid of the keys, which BDSIM uses, with the columns, which are read here.
+
+    Returns
+    -------
+    tuple of str
+        What the user should know if the rows are in another order than BDSIM takes them.
+
+    Raises
+    ------
+    MeasurementError
+        If the coordinates of the columns are not those of the keys.
+    """
+    axes = {}
+    for axis in "xyz":
+        column = axis.upper()
+        if column not in header or not {f"n{axis}", f"{axis}min", f"{axis}max"} <= keys.keys():
+            continue
+        try:
+            low, high = float(keys[f"{axis}min"]), float(keys[f"{axis}max"])
+        except ValueError:
+            low = high = np.nan
+        found, count = values[:, header.index(column)], int(keys[f"n{axis}"][:9])
+        near = NEAR * (abs(high - low) / max(count - 1, 1) or 1.0)
+        if not max(abs(found.min() - low), abs(found.max() - high)) <= near:
+            raise MeasurementError(must_be(
+                f"column {column}", where, f"from {keys[f'{axis}min']} to {keys[f'{axis}max']} cm, "
+                f"as its keys {axis}min and {axis}max say", f"{found.min():g} to {found.max():g}",
+                "BDSIM goes by the keys; correct them, or the column."))
+        axes[column] = np.linspace(low, high, count), near
+    order = list(axes) if "loopOrder" not in keys or keys["loopOrder"][:1] == "x" else [*axes][::-1]
+    grids = np.meshgrid(*(axes[column][0] for column in order[::-1]), indexing="ij")
+    for column, grid in zip(order[::-1], grids, strict=True):
+        found = values[:, header.index(column)]
+        if grid.size == len(found) and np.any(np.abs(grid.ravel() - found) > axes[column][1]):
+            return ("The rows are not in the order that the file's loopOrder says (default: xyzt, "
+                    "x changes fastest): BDSIM, which goes by the order, reads another field than "
+                    "this map, which goes by the columns X, Y, Z.",)
+    return ()
+
+
+def bdsim_lines(grid: Grid) -> Iterator[str]:
+    """Yield the lines of the file."""
+    for name, axis in zip(COMPONENTS, grid.axes, strict=True):
+        yield f"n{name}> {len(axis)}"
+        yield f"{name}min> {PER_M * float(axis[0])!r}"
+        yield f"{name}max> {PER_M * float(axis[-1])!r}"
+    yield "loopOrder> xyzt"
+    yield "! X Y Z Fx Fy Fz"
+    yield from grid.rows(PER_M, x_fastest=True)
