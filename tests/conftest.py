@@ -61,19 +61,20 @@ DIPOLE: dict[str, Any] = {
 StudyMaker = Callable[..., Study]
 
 LONGEST = [
-    "cli/test_all_keys.py", "docs/test_docs.py", "diagnosis/test_diagnose.py",
-    "response/test_nonlinear.py", "solver/test_iron_bodies.py",
-    "inference/test_doubted_terms.py", "measurement/test_map_join.py",
-    "measurement/test_map_check.py", "diagnosis/test_unlisted_causes.py", "report/test_view.py",
-    "diagnosis/test_iron_faults.py", "inference/test_infer.py", "solver/moments/test_solve.py",
-    "cli/test_cli.py", "synthetic/test_hidden_effects.py", "diagnosis/test_gross_errors.py",
-    "design/test_homogeneity_objective.py", "synthetic/test_fields.py",
-    "solver/test_azimuthal_modes.py", "solver/test_oracles.py", "response/test_homogeneity.py",
-    "synthetic/test_reaction.py", "solver/test_mpi.py", "solver/test_axisymmetric_iron.py",
-    "report/test_answers.py", "geometry/test_symmetry.py", "response/test_stray_field.py",
-    "inference/test_mcmc.py", "response/test_field_on_lines.py", "solver/test_getdp_cache.py",
-    "inference/test_line_registration.py", "diagnosis/test_several_maps.py",
-    "solver/test_dask_cluster.py", "design/test_forces.py", "synthetic/test_simulate.py",
+    "cli/test_all_keys.py", "docs/test_docs.py", "solver/test_iron_bodies.py",
+    "report/test_view.py", "cli/test_cli.py", "diagnosis/test_iron_faults.py",
+    "inference/test_doubted_terms.py", "inference/test_infer.py", "design/test_demagnetization.py",
+    "diagnosis/test_diagnose.py", "measurement/test_map_join.py", "synthetic/test_reaction.py",
+    "measurement/test_map_check.py", "response/test_nonlinear.py",
+    "diagnosis/test_sealed_cases.py", "report/test_answers.py",
+    "diagnosis/test_unlisted_causes.py", "synthetic/test_fields.py",
+    "solver/test_axisymmetric_iron.py", "solver/test_azimuthal_modes.py", "solver/test_oracles.py",
+    "design/test_forces.py", "cli/test_killed.py", "design/test_shim_tray.py",
+    "design/test_homogeneity_objective.py", "solver/moments/test_solve.py",
+    "synthetic/test_hidden_effects.py", "diagnosis/test_gross_errors.py",
+    "diagnosis/test_assembly.py", "diagnosis/test_screening.py", "geometry/test_symmetry.py",
+    "response/test_homogeneity.py", "solver/test_dask_cluster.py",
+    "inference/test_line_registration.py", "response/test_field_on_lines.py",
 ]
 """Files that take half a minute or more of processor time, the longest first."""
 

@@ -25,6 +25,7 @@ from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_bl
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
+from halbach_fe.solver.iron_modes import Resolution
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import read_study
@@ -257,15 +258,18 @@ class Case:
 def quick(getdp, tmp_path_factory):
     """Find GetDP once.
 
-    Elements of iron are three times as large as usual: only keys are tried here. Commands share
-    their runs of GetDP by a cache: one that passes over a key asks for another run than `solve`.
+    Elements of iron are three times as large as usual, twice if it is coaxial: only keys are tried
+    here. Commands share their runs of GetDP by a cache: one that passes over a key asks for another
+    run than `solve`.
     """
-    fine = Sizes.of
+    fine, usual = Sizes.of, Resolution()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(FOLDER_VARIABLE, str(tmp_path_factory.mktemp("cache")))
         patch.setenv(LIMIT_VARIABLE, "1")
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
         patch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 3.0 * coarseness))
+        patch.setattr(Resolution.__init__, "__defaults__", (
+            2 * usual.edge, usual.growth, 2 * usual.largest, None, usual.boundary))
         yield
 
 

@@ -53,16 +53,20 @@ def test_killed_and_run_again(tmp_path):
 
 
 ORPHANING = """
-import subprocess, time
-subprocess.Popen(["sleep", "15"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-time.sleep(6)
+import subprocess, sys, time
+try:
+    open(sys.argv[1], "x").close()
+except FileExistsError:
+    sys.exit()  # it is run again
+subprocess.Popen(["sleep", "9"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+time.sleep(30)
 """
 
 
 def test_a_process_that_survives_is_seen(tmp_path):
     """The control: a child that nothing ties to its parent."""
-    end = kill_and_run_again([sys.executable, "-c", ORPHANING], dict(os.environ), tmp_path,
-                             tmp_path, moment_s=4.0, patience_s=2.0)
+    end = kill_and_run_again([sys.executable, "-c", ORPHANING, str(tmp_path / "begun")],
+                             dict(os.environ), tmp_path, tmp_path, moment_s=2.0, patience_s=0.5)
     assert end.broken == ["sleep survives"]
 
 
@@ -71,7 +75,7 @@ import argparse, sys, time
 from halbach_fe.cli import common
 def run():
     with common.workers(argparse.Namespace(scheduler=None, jobs=1)) as pool:
-        waiting = [pool.submit(time.sleep, 2) for _ in range(30)]
+        waiting = [pool.submit(time.sleep, 0.5) for _ in range(120)]
         waiting[0].result()
         print("one", flush=True)
         return sum(one.result() is None for one in waiting)

@@ -18,6 +18,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
+from halbach_fe.geo.iron_bodies import Sizes
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.forces import forces_figure, page, round_below
 from halbach_fe.report.page import write_report
@@ -369,8 +370,12 @@ def test_a_coil_pulls_a_sphere(tmp_path):
     assert force < 0
 
 
-def test_bodies_that_no_plane_separates_feel_one_force(tmp_path):
-    """A ball in a bowl; and beside dipoles, whose part is not computed, there is no number."""
+def test_bodies_that_no_plane_separates_feel_one_force(tmp_path, monkeypatch):
+    """A ball in a bowl; and beside dipoles, whose part is not computed, there is no number. Their
+    elements are twice as large as usual: the sign of the force is all that is asked.
+    """
+    fine = Sizes.of
+    monkeypatch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 2.0 * coarseness))
     bowl = {"kind": "revolved", "centre_m": [0.0, 0.0, 0.1], "profile_m": [
         [0, 0], [0.03, 0], [0.03, 0.03], [0.02, 0.03], [0.02, 0.01], [0, 0.01]]}
     ball = {"kind": "sphere", "radius_m": 0.008, "centre_m": [0.0, 0.0, 0.12]}

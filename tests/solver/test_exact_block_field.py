@@ -12,6 +12,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import exact_block_field, field_kernels
 from halbach_fe.solver.exact_block_field import (
     FieldOfBlocks,
+    demagnetizing_tensors,
     field_of,
     gradient_of,
     unit_field,
@@ -248,6 +249,14 @@ def test_blocks_at_once_are_those_one_by_one(short_dipole, generator, monkeypatc
     blocks, points = build_magnet(study).blocks, scattered(study, generator, 30)
     for found, block in zip(unit_fields(blocks, points), blocks, strict=True):
         np.testing.assert_allclose(found, unit_field(block, points), rtol=1e-12, atol=1e-13)
+    alone = [demagnetizing_tensors([block])[0] for block in blocks]
+    calls, whole = [], exact_block_field._outline_field
+    monkeypatch.setattr(exact_block_field, "_outline_field", lambda block, points: (
+        calls.append(block), whole(block, points))[1])
+    np.testing.assert_allclose(demagnetizing_tensors(blocks), alone, atol=1e-12)
+    # besides one with a gradient and one with a corner, all 32 are told by one, or by as many as
+    # angles between easy axis and place
+    assert len(calls) == (18 if "orientation" in shape else 3)
     # negative control: outlines are not turned onto each other
     monkeypatch.setattr(exact_block_field, "_turn_deg", lambda block: 0.0)
     monkeypatch.setattr(exact_block_field, "_upright", lambda outline, angle: outline is None)
