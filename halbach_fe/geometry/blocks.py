@@ -32,6 +32,7 @@ from halbach_fe.geometry.surface import (
     contact_of_prism,
     contact_of_tube,
     distance_from_prism,
+    distance_from_tube,
 )
 from halbach_fe.study.materials import MU_0
 
@@ -344,11 +345,7 @@ def distance_from_blocks(blocks: Sequence[MagnetBlock], points: Floats, far_m: f
         if not len(near):
             continue
         if radii := ring_radii(block.outline):
-            radius = np.hypot(*places[near, :2].T)
-            across = np.maximum(radii[0] - radius, radius - radii[1])
-            along = np.maximum(block.z_min - places[near, 2], places[near, 2] - block.z_max)
-            own = np.hypot(*np.maximum([across, along], 0.0))
-            own = np.where(own > 0, own, np.maximum(across, along))
+            own = distance_from_tube(*radii, block.z_min, block.z_max, places[near])
         else:
             own = distance_from_prism(block.outline, block.z_min, block.z_max, places[near])
         found[near] = np.minimum(found[near], own)

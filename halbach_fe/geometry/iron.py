@@ -21,6 +21,9 @@ from halbach_fe.geometry.surface import (
     contact_of_sphere,
     contact_of_triangles,
     contact_of_tube,
+    distance_from_prism,
+    distance_from_triangles,
+    distance_from_tube,
 )
 from halbach_fe.study.iron import (
     CHORDS,
@@ -186,6 +189,19 @@ class IronSolid:
             return contact_of_prism(self.outline, self.z_min, self.z_max, points)
         return contact_of_tube(self.inner_radius, self.outer_radius, self.z_min, self.z_max,
                                points)
+
+    def distance(self, points: Floats) -> Floats:
+        """Return the distances (n,) in m of points (n, 3) in air from the body."""
+        places = points if self.in_place else (
+            points - self.origin_m) @ rotation_matrix(self.turn_rad)
+        if self.sphere:
+            return np.asarray(np.linalg.norm(places, axis=1) - self.outer_radius)
+        if self.triangles is not None:
+            return distance_from_triangles(self.triangles, places)
+        if self.outline is not None:
+            return distance_from_prism(self.outline, self.z_min, self.z_max, places)
+        return distance_from_tube(self.inner_radius, self.outer_radius, self.z_min, self.z_max,
+                                  places)
 
 
 def iron_solids(

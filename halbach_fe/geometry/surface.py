@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, face_vectors
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
@@ -174,10 +175,44 @@ def _touch_triangles(found: Contact, triangles: Floats, points: Floats, some: In
 
 def distance_from_prism(outline: Outline, z_min: float, z_max: float, points: Floats) -> Floats:
     """Return distances (n,) in m of points (n, 3) from a prism in its frame; negative inside."""
-    across = _section(outline, points[:, :2]).distance
+    return _distance(_section(outline, points[:, :2]).distance, z_min, z_max, points)
+
+
+def distance_from_tube(inner: float, outer: float, z_min: float, z_max: float,
+                       points: Floats) -> Floats:
+    """Return distances (n,) in m of points (n, 3) from a tube or, with ``inner`` 0, from a disc.
+
+    They are negative inside.
+    """
+    radius = np.hypot(*points[:, :2].T)
+    across = np.maximum(inner - radius, radius - outer) if inner else radius - outer
+    return _distance(across, z_min, z_max, points)
+
+
+def _distance(across: Floats, z_min: float, z_max: float, points: Floats) -> Floats:
+    """Return distances from a body along z, from those (n,) in m of its cross-section."""
     beyond = np.maximum(points[:, 2] - z_max, z_min - points[:, 2])
     outside = np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0))
     return np.where(outside > 0, outside, np.maximum(across, beyond))
+
+
+def distance_from_triangles(triangles: Floats, points: Floats) -> Floats:
+    """Return distances (n,) in m of points (n, 3) from the nearest of triangles (m, 3, 3)."""
+    found = np.asarray(KDTree(triangles.reshape(-1, 3)).query(points)[0])
+    for corners in triangles:
+        middle = corners.mean(axis=0)
+        reach = np.linalg.norm(corners - middle, axis=1).max()
+        near = np.flatnonzero(np.linalg.norm(points - middle, axis=1) - reach < found)
+        along = np.roll(corners, -1, axis=0) - corners
+        normal = face_vectors(corners[None])[0]
+        normal = normal / np.linalg.norm(normal)
+        starts = points[near, None] - corners
+        parts = np.einsum("nki,ki->nk", starts, along) / (along**2).sum(axis=1)
+        sides = np.linalg.norm(starts - parts.clip(0.0, 1.0)[..., None] * along, axis=2)
+        over = (np.einsum("nki,ki->nk", starts, np.cross(normal, along)) >= 0).all(axis=1)
+        own = np.where(over, np.abs(starts[:, 0] @ normal), sides.min(axis=1))
+        found[near] = np.minimum(found[near], own)
+    return found
 
 
 def _in_box(points: Floats, low: Sequence[float], high: Sequence[float],

@@ -50,16 +50,12 @@ from halbach_fe.measurement.harmonic_field import (
     solid_harmonic_fields,
 )
 from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel
-from halbach_fe.response.region import sphere_points
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 WITHIN = 0.75
 """Radius up to which readings are used, relative to that of the free sphere: at its surface the
 series has no end."""
-
-DIRECTIONS = 60
-"""Degree of the directions in which iron is looked for about a region's centre (6° apart)."""
 
 POOR = 1.15
 """Noise that a fit finds, relative to the stated one, above which it is not to be relied on: the
@@ -340,17 +336,11 @@ def _free_radius(magnet: Magnet, centre: Floats) -> float:
     """Return the radius in m of the sphere about a point that blocks, iron, coils and dipoles leave
     free.
     """
-    shells = 100  # so many are asked for iron: its bodies have no distance from a point
     external, here = magnet.external, centre[None]
     blocks = (*present_blocks(magnet.blocks),
               *neighbour_blocks(magnet.blocks, external.neighbours))
-    free = float(min([
+    return float(min([
         *distance_from_blocks(blocks, here, magnet.field_reach),
+        *(body.distance(here)[0] for body in magnet.iron),
         *(distance_in_magnet(coil, here)[0] for coil in external.coils),
         *(np.linalg.norm(centre - one.position_m) for one in external.dipoles)]))
-    directions, _ = sphere_points(DIRECTIONS)
-    for number in range(1, shells + 1 if magnet.iron else 1):
-        points = centre + number / shells * free * directions
-        if any(body.contains(points).any() for body in magnet.iron):
-            return (number - 1) / shells * free
-    return free

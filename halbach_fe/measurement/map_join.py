@@ -429,7 +429,9 @@ def _refuse_disobedient(name: str, check: MapCheck) -> None:
             f"one of which held-out lines are off by {decimals(1e3 * check.floor_rms_T)} mT rms"
             if check.suffices else "one with too few readings to tell",
             "Look at `halbach-fe check` of this map alone: rows that were shuffled, or columns "
-            "that are not what they say."))
+            "that are not what they say." if check.suffices else
+            "Measure it in a volume with a smaller spacing, or join it by the magnet: "
+            "halbach-fe register."))
 
 
 def join_checked(

@@ -37,8 +37,9 @@ other."""
 
 NEAR_SHARE = 0.7
 """Distance of points of a region from each other, relative to their distance from the nearest
-block. Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the peak to peak value was then
-found to 0.5 %, but with points at 1.5 to 8 times that distance it was up to half too large."""
+block or iron. Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the peak to peak value
+was then found to 0.5 %, but with points at 1.5 to 8 times that distance it was up to half too
+large."""
 
 VOLUME_SHARE = 1.0
 """The same of cells of the volume, with 2 or 3 Gauss points along each side. Of regions within 0.7
@@ -325,8 +326,8 @@ class Sampling:
     """Number of points on the surface, or on a sphere within it, that come first."""
     degree: int
     """Degree of the functions that these resolve, see `Region.points`."""
-    unresolved_m: float = 0.0
-    """Distance in m at which blocks are too near for the points; 0 if none is."""
+    unresolved_m: float | None = None
+    """Distance in m at which blocks or iron are too near for the points; None if none are."""
     inner_radius: float = 1.0
     """Radius of the first points relative to that of the region: less than 1 if they are on a
     sphere within it, because blocks are too near for those on the surface."""
@@ -336,10 +337,11 @@ class Sampling:
     @property
     def doubt(self) -> str:
         """Say that the extremes may lie between the points, or nothing."""
-        if not self.unresolved_m:
+        if self.unresolved_m is None:
             return ""
-        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks, nearer than "
-                "its points resolve: the true peak to peak may be larger than what is said.")
+        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks or iron, "
+                "nearer than its points resolve: the true peak to peak may be larger than what is "
+                "said.")
 
 
 def region_points(
@@ -400,7 +402,7 @@ def region_points(
 def _resolved(
     magnet: Magnet, region: Region, base: Sampling, shims: Sequence[MagnetBlock], degrees: int
 ) -> Sampling:
-    """Take denser points of a region where blocks are nearer than these are to each other."""
+    """Take denser points of a region where sources are nearer than these are to each other."""
     axes, spacing = np.array(region.half_axes_m), base.steps[0] * region.half_axes_m
     # of no cell that is halved the middle is farther from the blocks
     far = 2 * float(axes.max()) / NEAR_SHARE
@@ -411,8 +413,12 @@ def _resolved(
 
     from_zero = _distance_from_zero(region, base.points, blocks)
 
+    def clearance(points: Floats) -> Floats:
+        return np.min([distance_from_blocks(blocks, points, far),
+                       *(body.distance(points) for body in magnet.iron)], axis=0)
+
     def distance(points: Floats) -> Floats:
-        near = np.maximum(distance_from_blocks(blocks, points, far), least)
+        near = np.maximum(clearance(points), least)
         return near if from_zero is None else np.minimum(near, from_zero(points))
 
     parts, resolved = [], True
@@ -439,16 +445,16 @@ def _resolved(
     lengths = np.append(np.repeat(long[~small] / 3, 27), np.repeat(long[small] / 2, 8))
     base = replace(base, points=base.points[:base.surface])
     if region.shape == "sphere":
-        base = _with_inner_sphere(region, base, degrees, float(distance_from_blocks(
-            blocks, np.array([region.centre_m]), far)[0]))
+        base = _with_inner_sphere(region, base, degrees, float(clearance(
+            np.array([region.centre_m]))[0]))
     own = np.concatenate([NEAR_SHARE * distance(base.points), lengths, length])
-    nearest = float(distance_from_blocks(blocks, points, far).min())
+    nearest = float(clearance(points).min())
     found = replace(
         base, points=np.vstack([base.points, more, points]),
         weights=np.concatenate([np.zeros(len(base.points)), weights / weights.sum(),
                                 np.zeros(len(points))]),
         steps=np.minimum(own[:, None] / axes, base.steps[0]), near_shims=near_shims,
-        unresolved_m=0.0 if resolved and nearest >= least else max(nearest, 0.0))
+        unresolved_m=None if resolved and nearest >= least else max(nearest, 0.0))
     return _about_extremes(region, found, blocks)
 
 

@@ -16,6 +16,7 @@ import gmsh
 import numpy as np
 import pytest
 import tomlkit
+from scipy.spatial import KDTree
 
 from halbach_fe.core.errors import HalbachWarning, MeshError, StudyError
 from halbach_fe.geo.iron_bodies import _volume, check_apart
@@ -520,6 +521,26 @@ def test_bodies_in_any_place(short_dipole, generator, body, volume):
         on = np.array([[0.05, 0.0, 0.28]])
         assert solid.contact(on).on_face.all()
         assert (solid.contact(on).outward[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("body", [
+    BOX | {"rotation_deg": [20.0, -10.0, 70.0]},
+    {"kind": "sphere", "radius_m": 0.08, "centre_m": [0.05, 0.0, 0.2]},
+    tube(0.05, 0.06, length_m=0.1, rotation_deg=[90.0, 0.0, 0.0], centre_m=[0.0, 0.0, 0.2]),
+    {"kind": "prism", "outline_m": [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]],
+     "length_m": 0.05, "centre_m": [0.0, 0.0, 0.2], "holes": [{"radius_m": 0.06}]}],
+    ids=["box", "sphere", "tube", "drilled"])
+def test_distances_from_bodies(short_dipole, generator, body):
+    """None of many points inside is nearer, and one is hardly farther: they are 10 mm from each
+    other, so that at a corner some 8 are in the eighth of a ball of 25 mm.
+    """
+    (solid,) = magnet_of(short_dipole, body).iron
+    _, inside = fraction_inside(solid, generator)
+    points = generator.uniform([-0.3, -0.3, -0.1], [0.3, 0.3, 0.5], (60, 3))
+    points = points[~solid.contains(points)]
+    nearest = KDTree(inside).query(points)[0]
+    assert (solid.distance(points) <= nearest).all()
+    assert (solid.distance(points) >= nearest - 0.025).all()
 
 
 def test_a_moved_coaxial_tube_is_still_coaxial(short_dipole):

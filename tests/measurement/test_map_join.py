@@ -453,6 +453,13 @@ def test_a_shuffled_map_is_refused(generator):
         join_maps({"part1": shuffled, "part0": maps["part0"]})
 
 
+def test_a_map_of_few_readings_is_not_called_shuffled():
+    """No check of it would find anything: it is to be measured again, or joined by the magnet."""
+    few = SimpleNamespace(is_whole=True, suffices=False)
+    with pytest.raises(MeasurementError, match=r"too few readings to tell\. Measure it .*register"):
+        map_join._refuse_disobedient("part0", few)
+
+
 def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     """The command, from files to the page; a map that fails its own check is refused."""
     maps, _, _ = campaign(1, maps=2)

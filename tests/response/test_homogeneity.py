@@ -274,8 +274,36 @@ def test_points_follow_the_distance_from_blocks():
     assert not far.doubt
     near = region_points(magnet, Region("cylinder", (0.023999, 0.023999, 0.012)))
     assert "within 0.001 mm of blocks" in near.doubt
+    assert "within 0 mm of blocks" in region_points(
+        magnet, Region("cylinder", (0.024, 0.024, 0.012))).doubt  # it touches them
     with pytest.raises(StudyError, match="must be in air"):
         region_points(magnet, Region.sphere(0.0241))
+
+
+def test_points_follow_the_distance_from_iron(generator):
+    """Of a sphere in a uniform field the field is that of a dipole (J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., section 5.11). Control: points that do not know of it miss a third.
+    """
+    region, radius, mu = Region.sphere(0.01), 4e-4, 1000.0
+    towards = np.array([0.9, 0.3, 0.31]) / np.linalg.norm([0.9, 0.3, 0.31])
+    centre = 0.0106 * towards
+
+    def size(points):
+        away = points - centre
+        far = np.linalg.norm(away, axis=1)[:, None]
+        moment = np.array([0.0, 0.0, (mu - 1) / (mu + 2) * radius**3])
+        return np.linalg.norm([0.0, 0.0, 1.0] + 3 * away * (away @ moment)[:, None] / far**5
+                              - moment / far**3, axis=1)
+
+    near = towards + 0.05 * generator.standard_normal((20000, 3))
+    true = float(np.ptp(size(0.01 * near / np.linalg.norm(near, axis=1)[:, None])))
+    magnet = ring_of_cubes()
+    beside = magnet.with_(iron={"relative_permeability": mu, "bodies": [
+        {"kind": "sphere", "radius_m": radius, "centre_m": centre.tolist()}]})
+    found = [float(np.ptp(size(region_points(one, region).points))) for one in (beside, magnet)]
+    assert found[0] == pytest.approx(true, rel=0.03)
+    assert found[1] < 0.7 * true
+    assert not region_points(beside, region).doubt
 
 
 @pytest.mark.parametrize("order", [1, 2], ids=["dipole", "quadrupole"])
