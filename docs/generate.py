@@ -10,8 +10,9 @@ from halbach_fe.cli.verbs import VERBS, parser
 from halbach_fe.study.model import Study
 
 MODULES = (
-    "study.reader", "study.model", "study.array", "study.free_blocks", "study.iron", "study.magnet",
-    "study.measurement", "study.inference", "geometry.magnet", "stats.gaussian",
+    "study.reader", "study.model", "study.array", "study.free_blocks", "study.iron",
+    "study.external", "study.materials", "study.measurement", "study.inference", "geometry.magnet",
+    "stats.gaussian",
     "stats.posteriors", "solver.exact_block_field", "solver.ring_harmonics_2d",
     "measurement.field_map", "measurement.block_table", "measurement.campaign",
     "measurement.observation",

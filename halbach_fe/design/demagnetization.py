@@ -39,8 +39,7 @@ from halbach_fe.solver.magnetostatics import (
 from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0, grade_of
+from halbach_fe.study.materials import MU_0, Demagnetization, grade_of
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import ABSOLUTE_ZERO_C
 

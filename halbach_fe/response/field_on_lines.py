@@ -51,7 +51,7 @@ from halbach_fe.solver.separate_blocks import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.magnet import External
+from halbach_fe.study.external import External
 
 
 @dataclass(frozen=True)

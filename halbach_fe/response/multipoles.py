@@ -50,7 +50,7 @@ from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
-from halbach_fe.study.magnet import External
+from halbach_fe.study.external import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS

@@ -49,7 +49,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
-from halbach_fe.study.magnet import External
+from halbach_fe.study.external import External
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8

@@ -50,7 +50,7 @@ from halbach_fe.solver.moments.solve import (
     solve_irreversible,
 )
 from halbach_fe.solver.session import RunSize, Session
-from halbach_fe.study.magnet import External
+from halbach_fe.study.external import External
 
 MANY_BLOCKS = 64
 """Number of blocks from which their field on the iron is summed by expansions."""

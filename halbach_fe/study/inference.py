@@ -1,4 +1,6 @@
-"""Keys of a study that describe the inference: prior, held-out readings, plan, maps, doubts."""
+"""Keys of a study that describe the inference: prior, held-out readings, plan, maps, and what is
+uncertain beside the blocks, ``[instrument_sd]`` and ``[[uncertain]]``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Materials: magnetization curves H(B) of iron, and grades of permanent magnets by name.
+"""Materials: H(B) of iron, grades of permanent magnets by name, and the knee of these.
 
 **Iron.** A curve is isotropic, without hysteresis, and odd in B. Tables and closed forms are both
 converted to two constitutive laws: ``H = nu(B^2) B`` for the vector potential, and ``B = mu_0
@@ -11,7 +11,7 @@ polarization ``J = B - mu_0 H`` is constant.
 come from a few melts, so that they lie together somewhere in the range: its width is the standard
 deviation of an error that all blocks share (``prior.remanence_sd``), and says little about
 differences between the blocks. Every row of the table names its source; what no source says is
-None.
+None. No data sheet states a knee: it is at a share of the coercivity, see `Demagnetization`.
 """
 
 from __future__ import annotations
@@ -29,13 +29,20 @@ from types import MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import MU_0 as MU_0
 from halbach_fe.core.numbers import numbered_lines, parse_number
+from halbach_fe.study.types import (
+    RISING_PER_K,
+    ReferenceTemperature,
+    RemanenceCoefficient,
+    StudyModel,
+    Temperature,
+)
 
 COLUMNS = ("H_A_per_m", "B_T")
 MIN_POINTS = 4
@@ -435,7 +442,7 @@ class Grade:
 
     @property
     def demagnetization_defaults(self) -> dict[str, float]:
-        """Values of the grade for the keys of `halbach_fe.study.magnet.Demagnetization`.
+        """Values of the grade for the keys of `Demagnetization`.
 
         Keys that no source gives are missing. The coercivity is the smallest that the data sheet
         promises.
@@ -605,6 +612,73 @@ def check_grade(one: Grade) -> None:
 
 Material = Annotated[str, Field(max_length=40), AfterValidator(lambda name: grade(name).name)]
 """Name of a grade of magnet, in any spelling; the study holds the table's."""
+
+MOST_SQUARE = 0.99
+"""Largest squareness for which irreversible losses are computed."""
+
+
+class Demagnetization(StudyModel):
+    """Resistance of the magnet material to demagnetization, and the temperature to assess it at.
+
+    Remanence (of ``array``) and intrinsic coercivity are the data-sheet values at
+    ``reference_temperature_C``; both change linearly with temperature, by the fraction
+    ``..._coefficient_per_K`` per kelvin. ``temperature_C`` is the highest temperature of the
+    magnet. The knee of the demagnetization curve is at ``squareness`` times the intrinsic
+    coercivity, where the polarization is a tenth below the remanence (H_k of IEC 60404-8-1).
+
+    With ``irreversible`` the blocks have lost for good what the field that they are in takes, and
+    the field of the magnet is that with the losses; see `halbach_fe.solver.moments.solve`.
+    The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
+    """
+
+    # of AlNiCo at least 38e3 A/m; numbers of NdFeB in oersted end at 36e3
+    intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=3.6e4, le=5e6)]
+    squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    remanence_coefficient_per_K: RemanenceCoefficient
+    coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
+    reference_temperature_C: ReferenceTemperature = 20.0
+    temperature_C: Temperature = 20.0
+    irreversible: bool = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Demagnetization:
+        # Temperature coefficient of the remanence above which a magnet is no ferrite, which has
+        # -0.002/K; that of NdFeB is -0.0012/K, of SmCo -0.0004/K and of AlNiCo -0.0002/K.
+        ferrite_per_k = -1.5e-3
+        if self.irreversible and self.squareness > MOST_SQUARE:
+            raise ValueError(f"squareness must be at most {MOST_SQUARE} for irreversible losses, "
+                             f"not {self.squareness}; the polarization would jump at the knee")
+        if self.coercivity_coefficient_per_K > RISING_PER_K and (
+                self.remanence_coefficient_per_K > ferrite_per_k):
+            raise ValueError(
+                f"coercivity_coefficient_per_K ({self.coercivity_coefficient_per_K}) lets the "
+                "coercivity rise with the temperature, as that of ferrite alone does, but "
+                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is not that of "
+                "ferrite; other magnets have a negative one")
+        if self.remanence_coefficient_per_K < ferrite_per_k and self.worst_when_cold and (
+                self.coercivity_coefficient_per_K <= RISING_PER_K):
+            raise ValueError(
+                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is that of "
+                "ferrite, whose coercivity rises with the temperature, but "
+                f"coercivity_coefficient_per_K is {self.coercivity_coefficient_per_K}; are the two "
+                "exchanged?")
+        for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
+                                  ("coercivity", self.coercivity_coefficient_per_K)):
+            if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
+                raise ValueError(f"{name}_coefficient_per_K ({coefficient}) makes the {name} zero "
+                                 f"or negative at {self.temperature_C:g} °C; use a fraction per "
+                                 "kelvin, not per cent, and a temperature in °C, not in kelvin, "
+                                 "that the linear law holds for")
+        return self
+
+    @property
+    def worst_when_cold(self) -> bool:
+        """Whether the coercivity falls less with the temperature than the field that opposes it.
+
+        That field is proportional to the remanence. The coercivity of ferrite even rises.
+        """
+        return self.coercivity_coefficient_per_K > self.remanence_coefficient_per_K
+
 
 STRENGTHS = ("remanence_T", "block_moment_A_m2", "remanence_x_T", "remanence_y_T", "remanence_z_T")
 """Keys that give the strength of a block; any of them wins over the grade."""

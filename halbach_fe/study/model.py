@@ -22,6 +22,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
 from halbach_fe.study.array import Array, common_material, remanence_sds
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
+from halbach_fe.study.external import External
 from halbach_fe.study.inference import (
     POSE_KEYS,
     PROBE_KEYS,
@@ -34,8 +35,7 @@ from halbach_fe.study.inference import (
     check_uncertain,
 )
 from halbach_fe.study.iron import Iron, IronCurve, IronRing
-from halbach_fe.study.magnet import Demagnetization, External
-from halbach_fe.study.materials import Curve, grade, grade_of
+from halbach_fe.study.materials import Curve, Demagnetization, grade, grade_of
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.types import (
     COMPONENTS,

@@ -30,7 +30,7 @@ from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
 from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import noise_regions
-from halbach_fe.study.magnet import check_apart
+from halbach_fe.study.external import check_apart
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

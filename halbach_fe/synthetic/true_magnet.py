@@ -19,8 +19,8 @@ from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study import materials
+from halbach_fe.study.external import External
 from halbach_fe.study.iron import Iron, IronMaterial
-from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.shapes import (

@@ -22,8 +22,7 @@ from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.report.demagnetization import answer, demagnetization_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0, grade
+from halbach_fe.study.materials import MU_0, Demagnetization, grade
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of

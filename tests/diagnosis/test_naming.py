@@ -20,7 +20,7 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import with_memory, without_memory
 from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.study.magnet import Neighbour
+from halbach_fe.study.external import Neighbour
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study

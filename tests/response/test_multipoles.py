@@ -32,8 +32,8 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.external import External
 from halbach_fe.study.inference import shifted
-from halbach_fe.study.magnet import External
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field

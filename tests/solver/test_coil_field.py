@@ -12,7 +12,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.coils import distance
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import coil_field, external_field
-from halbach_fe.study.magnet import External
+from halbach_fe.study.external import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of

@@ -16,8 +16,7 @@ from scipy import stats
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.magnets import magnet_of_blocks, write_study
 from halbach_fe.study import materials as module
-from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import check_grade, grade, grades, read_grades
+from halbach_fe.study.materials import Demagnetization, check_grade, grade, grades, read_grades
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
 

@@ -24,8 +24,7 @@ from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.solve import KneeLaw
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.magnet import MOST_SQUARE, Demagnetization
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MOST_SQUARE, MU_0, Demagnetization
 from halbach_fe.study.model import Study, iron_of
 
 STEP = 0.02

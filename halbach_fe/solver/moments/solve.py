@@ -69,8 +69,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction, Neighbours
-from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0
+from halbach_fe.study.materials import MU_0, Demagnetization
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 MAX_STEPS = 100

@@ -14,8 +14,7 @@ from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.solver.moments.solve import KneeLaw, System, solve_irreversible
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import Session
-from halbach_fe.study.magnet import Demagnetization
-from halbach_fe.study.materials import MU_0, grade
+from halbach_fe.study.materials import MU_0, Demagnetization, grade
 from halbach_fe.study.reader import parse_study
 from tests.solver.moments.bodies import cuboid
 

@@ -1,4 +1,4 @@
-"""Keys of a study that describe fields of other sources, and the resistance to demagnetization."""
+"""Keys of a study that describe fields from outside the magnet: coils, neighbours and dipoles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.types import (
-    RISING_PER_K,
     Angle,
     FluxDensityVector,
     Gap,
@@ -19,15 +18,9 @@ from halbach_fe.study.types import (
     Place,
     Places,
     Point,
-    ReferenceTemperature,
-    RemanenceCoefficient,
     Rotation,
     StudyModel,
-    Temperature,
 )
-
-MOST_SQUARE = 0.99
-"""Largest squareness for which irreversible losses are computed."""
 
 
 class Neighbour(StudyModel):
@@ -177,66 +170,3 @@ def check_apart(external: External, points: Floats, study: str) -> None:
                 f"at least {1e6 * closest_m:g} µm from the readings",
                 f"the place of the reading at ({x:g}, {y:g}, {z:g}) m",
                 "An object that near is no point; leave it or the reading out."))
-
-
-class Demagnetization(StudyModel):
-    """Resistance of the magnet material to demagnetization, and the temperature to assess it at.
-
-    Remanence (of ``array``) and intrinsic coercivity are the data-sheet values at
-    ``reference_temperature_C``; both change linearly with temperature, by the fraction
-    ``..._coefficient_per_K`` per kelvin. ``temperature_C`` is the highest temperature of the
-    magnet. The knee of the demagnetization curve is at ``squareness`` times the intrinsic
-    coercivity, where the polarization is a tenth below the remanence (H_k of IEC 60404-8-1).
-
-    With ``irreversible`` the blocks have lost for good what the field that they are in takes, and
-    the field of the magnet is that with the losses; see `halbach_fe.solver.moments.solve`.
-    The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
-    """
-
-    # of AlNiCo at least 38e3 A/m; numbers of NdFeB in oersted end at 36e3
-    intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=3.6e4, le=5e6)]
-    squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
-    remanence_coefficient_per_K: RemanenceCoefficient
-    coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
-    reference_temperature_C: ReferenceTemperature = 20.0
-    temperature_C: Temperature = 20.0
-    irreversible: bool = False
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Demagnetization:
-        # Temperature coefficient of the remanence above which a magnet is no ferrite, which has
-        # -0.002/K; that of NdFeB is -0.0012/K, of SmCo -0.0004/K and of AlNiCo -0.0002/K.
-        ferrite_per_k = -1.5e-3
-        if self.irreversible and self.squareness > MOST_SQUARE:
-            raise ValueError(f"squareness must be at most {MOST_SQUARE} for irreversible losses, "
-                             f"not {self.squareness}; the polarization would jump at the knee")
-        if self.coercivity_coefficient_per_K > RISING_PER_K and (
-                self.remanence_coefficient_per_K > ferrite_per_k):
-            raise ValueError(
-                f"coercivity_coefficient_per_K ({self.coercivity_coefficient_per_K}) lets the "
-                "coercivity rise with the temperature, as that of ferrite alone does, but "
-                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is not that of "
-                "ferrite; other magnets have a negative one")
-        if self.remanence_coefficient_per_K < ferrite_per_k and self.worst_when_cold and (
-                self.coercivity_coefficient_per_K <= RISING_PER_K):
-            raise ValueError(
-                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is that of "
-                "ferrite, whose coercivity rises with the temperature, but "
-                f"coercivity_coefficient_per_K is {self.coercivity_coefficient_per_K}; are the two "
-                "exchanged?")
-        for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
-                                  ("coercivity", self.coercivity_coefficient_per_K)):
-            if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
-                raise ValueError(f"{name}_coefficient_per_K ({coefficient}) makes the {name} zero "
-                                 f"or negative at {self.temperature_C:g} °C; use a fraction per "
-                                 "kelvin, not per cent, and a temperature in °C, not in kelvin, "
-                                 "that the linear law holds for")
-        return self
-
-    @property
-    def worst_when_cold(self) -> bool:
-        """Whether the coercivity falls less with the temperature than the field that opposes it.
-
-        That field is proportional to the remanence. The coercivity of ferrite even rises.
-        """
-        return self.coercivity_coefficient_per_K > self.remanence_coefficient_per_K
