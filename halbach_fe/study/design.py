@@ -141,7 +141,8 @@ class ShimMagnet(StudyModel):
         step = 90 if self.size_m[0] == self.size_m[1] else 180
         if any(angle % step for angle in self.angles_deg):
             raise ValueError(f"angles_deg of shim magnet '{self.name}' must be multiples of "
-                             f"{step}, so that it fits into its place")
+                             f"{step}, so that it fits into its place; write angles_deg = "
+                             f"{list(range(0, 360, step))}")
         return self
 
     @model_validator(mode="after")
