@@ -1,7 +1,7 @@
 """Mesh of bodies of iron and of the air near them, in curved tetrahedra of second order.
 
 Blocks do not shape it. Around the air lies a shell that GetDP maps to the rest of space.
-Rings of iron about z are meshed, or as sectors with the blocks, in `magnet_meshes`.
+Rings of iron about z are meshed in `magnet_meshes`, in the half-plane (r, z) or with the blocks.
 """
 
 from __future__ import annotations

@@ -75,22 +75,22 @@ _CLOSED_FORM_POINTS = 800
 
 @dataclass(frozen=True)
 class ConstitutiveLaw:
-    """An isotropic law y = c(|x|^2) x between two vectors.
+    """An isotropic law ``y = c(|x|^2) x`` between two vectors.
 
-    The coefficient c is interpolated by Akima's method; beyond the last point d|y|/d|x| is
-    constant.
+    The coefficient c is interpolated by Akima's method; beyond the last point ``d|y|/d|x|``
+    is constant.
     """
 
     squares: Floats
-    """Values of |x|^2, ascending from 0. Shape (n,), in T^2."""
+    """Values of ``|x|^2``, ascending from 0. Shape (n,), in T^2."""
     values: Floats
     """The coefficient c at ``squares``. Shape (n,)."""
     limit: float
-    """d|y|/d|x| beyond the last point."""
+    """``d|y|/d|x|`` beyond the last point."""
 
     @property
     def excess(self) -> float:
-        """The value of |y| - limit |x|, which is constant beyond the last point."""
+        """The value of ``|y| - limit |x|``, which is constant beyond the last point."""
         return float((self.values[-1] - self.limit) * np.sqrt(self.squares[-1]))
 
     @cached_property
@@ -103,7 +103,7 @@ class ConstitutiveLaw:
         return self._spline.derivative()
 
     def coefficient(self, square: Floats) -> Floats:
-        """Return c at values (...,) of |x|^2 in T^2."""
+        """Return c at values (...,) of ``|x|^2`` in T^2."""
         inside = self._spline(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
@@ -111,7 +111,7 @@ class ConstitutiveLaw:
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def slope(self, square: Floats) -> Floats:
-        """Return dc / d(|x|^2) at values (...,) of |x|^2 in T^2."""
+        """Return ``dc / d(|x|^2)`` at values (...,) of ``|x|^2`` in T^2."""
         inside = self._derivative(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
@@ -120,7 +120,7 @@ class ConstitutiveLaw:
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def differential(self, square: Floats) -> Floats:
-        """Return d|y| / d|x| = c + 2 |x|^2 dc/d(|x|^2) at values (...,) of |x|^2 in T^2."""
+        """Return ``d|y|/d|x| = c + 2 |x|^2 dc/d(|x|^2)`` at values (...,) of ``|x|^2`` in T^2."""
         return self.coefficient(square) + 2 * (square * self.slope(square))
 
 

@@ -1,8 +1,10 @@
 """The catalogue of effects that the diagnosis searches for, grouped by what they act on.
 
 An effect is a deviation of the real magnet or mapper from the study: a displaced block, a gain
-error of a sensor, an iron ring that the study does not mention. Another package adds effects by
-entry points of the group ``halbach_fe.effects``; each entry names a sequence of `Effect` objects.
+error of a sensor, an iron ring that the study does not mention. Its amplitudes and their prior
+standard deviations are the parameters of its entry in a list ``EFFECTS`` of a module here. Another
+package adds effects by entry points of the group ``halbach_fe.effects``; each entry names a
+sequence of `Effect` objects.
 """
 
 from __future__ import annotations
