@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,7 @@ from halbach_fe.solver.azimuthal_modes import to_cartesian
 from halbach_fe.solver.dofs import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_modes import (
+    Asked,
     Complexes,
     Exterior,
     IronModes,
@@ -233,7 +235,9 @@ def solve_iron(
     check_bodies(bodies)
     return_memory()  # of an earlier solution, which nobody needs any more
     resolution = resolution or Resolution()
-    modes = start.problem.modes if start else assemble_modes(name, bodies, resolution, session)
+    modes = start.problem.modes if start else _assembled(Asked(
+        (tuple(bodies), replace(resolution, modes=None), session.getdp),
+        partial(assemble_modes, name, bodies, resolution, session)))
     samples = _sampled(modes, source)
     present, highest = _modes_of(samples)
     highest = resolution.modes or highest
@@ -248,6 +252,11 @@ def solve_iron(
         bodies, source, session.within("coarse"), name, resolution.coarser(highest),
         estimate=False, start=start.coarse if start else None) if estimate else None
     return IronReaction(name, problem, total, total - own, residuals, coarse)
+
+
+@lru_cache(maxsize=1)  # bodies are equal whatever their law: those of a diagnosis differ by it
+def _assembled(asked: Asked[IronModes]) -> IronModes:
+    return asked.compute()
 
 
 def _problem(modes: IronModes, bodies: tuple[IronSolid, ...], numbers: Ints) -> Problem:

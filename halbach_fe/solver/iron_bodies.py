@@ -21,11 +21,10 @@ is a mean over all of the iron.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -57,7 +56,7 @@ from halbach_fe.solver.interpolation import (
     shape_functions,
     slopes_in,
 )
-from halbach_fe.solver.iron_modes import MESH, alone, assembled
+from halbach_fe.solver.iron_modes import MESH, Asked, alone, assembled
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import RunSize, Session
@@ -520,17 +519,6 @@ def solve_bodies(
     total, residuals = newton(problem, own, start.total if start else None,
                               lambda share: advance(before + int((100 - before) * share)))
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
-
-
-Found = TypeVar("Found", covariant=True)
-
-
-@dataclass(frozen=True)
-class Asked(Generic[Found]):
-    """What is to be computed once: what it depends on, and how to do it."""
-
-    key: tuple[object, ...]
-    compute: Callable[[], Found] = field(compare=False)
 
 
 @lru_cache(maxsize=2)  # that of the field and a coarser one; blocks that are updated change neither

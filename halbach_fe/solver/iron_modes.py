@@ -32,6 +32,7 @@ from functools import cached_property
 from importlib import resources
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -236,6 +237,17 @@ class GaussPoints:
         gradient = self.gradient(mode)
         weights = np.tile(self.weights * permeability, 3)
         return sparse.csr_array(gradient.T @ (sparse.diags_array(weights) @ gradient))
+
+
+Found = TypeVar("Found", covariant=True)
+
+
+@dataclass(frozen=True)
+class Asked(Generic[Found]):
+    """What is to be computed once: what it depends on, and how to do it."""
+
+    key: tuple[object, ...]
+    compute: Callable[[], Found] = field(compare=False)
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,8 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import FieldOfBlocks, external_field, unit_fields
-from halbach_fe.solver.iron_bodies import (
-    COARSER,
-    Asked,
-    BodiesReaction,
-    key_of,
-    size_of,
-    solve_bodies,
-)
-from halbach_fe.solver.iron_modes import Resolution, check_bodies
+from halbach_fe.solver.iron_bodies import COARSER, BodiesReaction, key_of, size_of, solve_bodies
+from halbach_fe.solver.iron_modes import Asked, Resolution, check_bodies
 from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.moments.solve import (
     KneeLaw,

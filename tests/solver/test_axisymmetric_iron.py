@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.core.errors import GetDPError, PointsOutsideError, StudyError
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver import iron_modes
+from halbach_fe.solver import axisymmetric_iron, iron_modes
 from halbach_fe.solver.axisymmetric_iron import coupled_modes, solve_iron, to_angles, to_modes
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.iron_modes import Resolution, grid_lines, iron_cells
@@ -179,6 +179,28 @@ def test_bars_cover_the_error_and_are_no_longer_than_needed(session):
     bars = found.error(points)[:, 0]
     assert np.mean(error <= 2 * bars) >= 0.95
     assert np.linalg.norm(bars) < 5 * np.linalg.norm(error)
+
+
+def test_iron_of_another_law_is_not_assembled_again(session, monkeypatch):
+    """A diagnosis compares iron of several saturations in one place. The controls are another
+    thickness, which is, and the field, which is that of the other law.
+    """
+    def solved(body):
+        return solve_iron([body], STRONG, session, resolution=FEW, estimate=False).field(POINTS)
+
+    softer = replace(TUBE, law=froehlich_kennelly(IRON["initial"], 0.9))
+    axisymmetric_iron._assembled.cache_clear()
+    alone = solved(softer)
+    axisymmetric_iron._assembled.cache_clear()
+    made, assemble = [], axisymmetric_iron.assemble_modes
+    monkeypatch.setattr(axisymmetric_iron, "assemble_modes",
+                        lambda *given: made.append(given) or assemble(*given))
+    first, second = solved(TUBE), solved(softer)
+    assert len(made) == 1
+    np.testing.assert_allclose(second, alone, atol=1e-12 * np.abs(alone).max())
+    assert worst(first, second) > 0.03
+    solved(replace(TUBE, outer_radius=1.1 * TUBE.outer_radius))
+    assert len(made) == 2
 
 
 def test_a_weak_source_sees_the_initial_permeability(session):

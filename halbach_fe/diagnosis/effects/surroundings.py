@@ -265,9 +265,11 @@ class IronRingEffect(Effect):
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         here = nominal.solve(self.apply(nominal.study, place, values))
         steps = (STEP_M, STEP_M, *(SHARE * one.sd for one in self.refinements[2:]))
-        return np.array([(nominal.solve(self.apply(nominal.study, place, np.add(
-            values, step * axis).tolist())) - here) / step
-            for step, axis in zip(steps, np.eye(5)[1:], strict=True)])
+        changes = np.empty((len(steps), *here.shape))
+        for number in (2, 3, 0, 1):  # first other iron in the same place, which is assembled once
+            moved = np.add(values, steps[number] * np.eye(5)[1 + number]).tolist()
+            changes[number] = nominal.solve(self.apply(nominal.study, place, moved)) - here
+        return changes / np.array(steps)[:, None, None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         clearance_m = 2e-4  # smallest distance between blocks and iron
