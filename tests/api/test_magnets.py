@@ -662,8 +662,8 @@ def test_noise_that_is_none(sigma):
 
 
 def test_a_result_without_a_page(tmp_path):
-    """What no function has returned; the refusal names the commands that write such files."""
-    with pytest.raises(hf.HalbachError, match="the commands of these names write the"):
+    """What no function has returned; the refusal names the command that writes such files."""
+    with pytest.raises(hf.HalbachError, match="the command of this name writes the files"):
         hf.write_report(POINTS, tmp_path)
 
 

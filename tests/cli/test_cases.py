@@ -130,12 +130,12 @@ def test_prisms_from_their_tip_and_a_ring(tmp_path, capsys):
 
 
 def test_advice_for_permeable_prisms(tmp_path):
-    """It lowers the bar from 1.60 to 0.07 mT, as was measured."""
+    """It lowers the bar from 1.60 to 0.08 mT, as was measured."""
     before, after = solved("permeable.toml", tmp_path / "2"), solved(
         "permeable.toml", tmp_path / "4", mesh__cells_per_side=4)
     assert "a larger mesh.cells_per_side (now 2)" in page_of(before).answer.step
     assert before.errors.max() == pytest.approx(1.605e-3, rel=0.01)
-    assert after.errors.max() == pytest.approx(0.07e-3, rel=0.05)
+    assert after.errors.max() == pytest.approx(0.077e-3, rel=0.05)
 
 
 def test_an_outline_in_mm(tmp_path, capsys):

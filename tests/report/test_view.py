@@ -148,7 +148,7 @@ def test_the_camera_is_on_the_side_of_what_was_found():
     """Slot 13 of 24 is at negative x; the control, slot 1, at positive x."""
     study = study_of("cubes")
     magnet, known = build_magnet(study), known_of(study)
-    behind = '"camera":{"eye":{"x":-'
+    behind = '"eye":{"x":-'
     assert behind in magnet_view(magnet, known, named={(1, 13)})
     assert behind not in magnet_view(magnet, known, named={(1, 1)})
 
