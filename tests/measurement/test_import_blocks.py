@@ -41,7 +41,7 @@ def rows(values, before=("A1;1;1;", "A2;1;2;"), after=""):
     ("id;layer;place;Jx [mT];Jy [mT];Jz [mT];Volume [cm^3];sd [%]\n"
      + rows(1e3 * J, after=";12;0.1"), {}),
     ("id;ring;slot;Mx [kA/m];My [kA/m];Mz [kA/m]\n" + rows(MOMENT / VOLUME / 1e3),
-     {"fixed": {"volume": "12 cm^3", "sigma": "0.1 %"}}),
+     {"fixed": {"volume": "12cm^3", "sigma": "0.1%"}}),  # no blank, as people write it
     ("# coil 7\nMagnet;Ring;Slot;Moment z (emu);Moment x (emu);Moment y (emu)\n"
      + rows(1e3 * MOMENT), {"axes": ("x", "y", "z"), "fixed": {"sigma": "0.012 A m^2"},
                             "columns": ("serial", "ring", "slot", "moment_x[emu]", "moment_y[emu]",

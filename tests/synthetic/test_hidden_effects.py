@@ -640,6 +640,17 @@ def test_effects_on_blocks_that_are_not_there(text):
         simulate_campaign(parse_study(RINGS), 1, hide=[parse_hidden_effect(text)])
 
 
+@pytest.mark.parametrize(("text", "allowed"), [
+    ("wrong_ring_count=-2", "wrong_ring_count=-1"), ("wrong_radius=-0.9", "wrong_radius=-0.01")])
+def test_effects_that_leave_no_magnet_or_no_circle(text, allowed):
+    """The map was noise alone, or of points on the other side. Negative control: a smaller one."""
+    section = parse_study(RINGS)
+    site = site_of(section, magnet_of(section))
+    with pytest.raises(StudyError, match=r"of --hide wrong_r.* must be a"):
+        choose_effects(site, [parse_hidden_effect(text)], 0, np.random.default_rng(0))
+    assert choose_effects(site, [parse_hidden_effect(allowed)], 0, np.random.default_rng(0))
+
+
 def test_effects_that_a_study_cannot_have():
     for text, document in (("ring_gap=1,1e-4", SECTION), ("gain_z=0.1", changed(
             RINGS, observation__components=["x"])), ("iron_ring", changed(RINGS, iron_ring={

@@ -98,6 +98,8 @@ KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys
     f"{name}_{axis}": kind for axis in COMPONENTS for name, kind in (
         ("at", "length"), ("size", "length"), ("rotation", "angle"), *VECTORS.items())} | VECTORS
 """Kinds of the units of quantities that have one."""
+STATED = re.compile(r"([-+]?[\d.,]+(?:[eE][-+]?\d+)?)\s*(.*)")
+"""A number and its unit, with a blank between them or without: people write 0.2% and 12cm^3."""
 KELVIN = ("K", "kelvin")
 TEMPERATURES = ("C", "\u00b0C", "degC", "Celsius", "celsius", *KELVIN)
 """Units of temperatures; C if none is stated."""
@@ -300,7 +302,8 @@ def _columns(
             raise MeasurementError(must_be(
                 f"--fixed {name}", where, "what the table does not say", "a value beside a column "
                 "of it", "Leave it out, or ignore the column by - in --columns."))
-        value, _, said = text.partition(" ")
+        found = STATED.fullmatch(text)
+        value, said = found.groups() if found else text.partition(" ")[::2]
         value = value.replace(".", ",") if declared.decimal_comma else value
         cells[name] = [value if name in KIND or name == "temperature" else text] * len(body)
         unit[name] = said

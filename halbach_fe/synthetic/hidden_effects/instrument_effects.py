@@ -416,6 +416,18 @@ def _of_two_axes(_: Site, values: Values) -> Refused:
         "second", "another axis than the first", values["second"])
 
 
+def _of_a_circle(site: Site, values: Values) -> Refused:
+    """Refuse a change by which a circle would have no radius, or a negative one."""
+    return None if values["change"] > -site.radius or site.radius == 0 else (
+        "change", f"above {-site.radius:g} m, minus the radius of the map", values["change"])
+
+
+def _of_some_rings(site: Site, values: Values) -> Refused:
+    """Refuse to remove all rings: the map would be of no magnet."""
+    return None if values["more"] > -site.rings else (
+        "more", f"at least {1 - site.rings}, so that a ring is left", values["more"])
+
+
 def _nothing(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
     """Draw the values of an effect without parameters."""
     return ()
@@ -426,7 +438,7 @@ GROSS_ERRORS = (
     _gross("wrong_radius", "change m", lambda site, generator: (
         signed_log_uniform(generator, 0.05, 0.2) * (
              site.radius if site.radius > 0 else site.inner),), _plus("radius_error"),
-         change=METRES),
+         check=_of_a_circle, change=METRES),
     _gross("swapped_axes", "first, second", _draw_swap, _swapped, "axes", check=_of_two_axes),
     _gross("sign_flipped_axis", "axis", lambda site, generator: (
         float(1 + "xyz".index(generator.choice(site.components))),), _sign_flipped, "axes"),
@@ -443,7 +455,7 @@ GROSS_ERRORS = (
     HiddenEffect("wrong_ring_count", "gross", parameters("more"),
                  lambda site, generator: (float(generator.choice([-1.0, 1.0]))
                                           if site.rings > 1 else 1.0,),
-                 wrong_ring_count, needs=("3d", "equal rings")),
+                 wrong_ring_count, needs=("3d", "equal rings"), check=_of_some_rings),
 )
 
 EFFECTS = (*FAULTS, *GROSS_ERRORS)
