@@ -61,7 +61,7 @@ OUTWARDS = {"wrong_radius": "farther out"}
 LOSS = "loss"
 """Parameter of effects that weaken blocks; a block that loses more than it had is reversed."""
 
-PERCENT_PARAMETERS = {"gain", LOSS, "gradient", "scale"}
+PERCENT_PARAMETERS = {"gain", LOSS, "gradient", "scale", "permeability above 1000 by"}
 """Dimensionless parameters that reports show in percent."""
 
 

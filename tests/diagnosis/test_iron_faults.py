@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.geo.iron_bodies import Sizes
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.iron import IronRing
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
@@ -74,6 +77,8 @@ def test_blocks_beside_a_tube_that_saturates(session):
     found = diagnose(study, seen.readings, session, effects=some)
     (named,) = found.identified
     assert named.hypothesis.effect.name == "iron_ring"
+    assert re.search(r"radii of [\d.]+ and [\d.]+ mm, farther out by \S+ ± \S+ mm; thicker by",
+                     answer(found).said)
     off = np.subtract(named.place.at_m, (inner, outer))
     _, farther, thicker, *_ = named.sd
     assert abs(off[0]) < 3 * farther

@@ -227,10 +227,10 @@ class IronRingEffect(Effect):
     title = "iron ring around the magnet"
     is_solved = True
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
-    refinements = (Parameter("farther_out", "m", 0.01, longest_step=0.005),
-                   Parameter("thicker", "m", 0.005, longest_step=0.005),
-                   Parameter("higher_saturation", "T", 0.2),
-                   Parameter("more_permeable", "1", 0.7, longest_step=0.5))
+    refinements = (Parameter("farther out by", "m", 0.01, longest_step=0.005),
+                   Parameter("thicker by", "m", 0.005, longest_step=0.005),
+                   Parameter("saturation above 2 T by", "T", 0.2),
+                   Parameter("permeability above 1000 by", "1", 0.7, longest_step=0.5))
     unique = True
     applied_in_full = True
 
@@ -238,7 +238,8 @@ class IronRingEffect(Effect):
         if iron_of(study) is not None or study.prior.variation_sd:  # which no study has beside iron
             return []
         blocks = build_magnet(study).array_outer_radius
-        return [Place(at_m=(blocks + gap, blocks + gap + thickness))
+        return [Place(at_m=(inner := blocks + gap, outer := inner + thickness),
+                      words=f"radii of {1e3 * inner:.4g} and {1e3 * outer:.4g} mm")
                 for gap, thickness in ((0.004, 0.002), (0.004, 0.01), (0.004, 0.005),
                                        (0.004, 0.025), (0.02, 0.01))]
 
