@@ -203,14 +203,15 @@ def _fitted(
         (observation.points[seen] - centre) / free_m)) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
-    # Share of readings above which they leave no noise over, of which bars follow: of fits that
-    # went through all readings they were 10 to 90 times too short; of a right one it was 0.88.
+    # Harmonics that are determined, as a share of the readings, above which the fit goes through
+    # all readings and shows no noise to take bars from: these were 10 to 90 times too short. A fit
+    # whose bars were right had 0.88.
     through = 0.95
     if fit.used > through * len(scaled):
         return None, np.nan, (
             f"has {len(scaled)} readings within {1e3 * WITHIN * free_m:.3g} mm of the region's "
-            "centre, which as many harmonics go through: it does not tell how homogeneous the "
-            "field is. Measure more points there.")
+            "centre. A fit goes through all of them, so that it shows neither its noise nor its "
+            "error: it does not tell how homogeneous the field is. Measure more points there.")
     terms = open_columns(study, lambda at: (
         _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3), maps, readings)[
             used] / sd[:, None]
