@@ -225,7 +225,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
     # what was named stands, whatever is suspected besides
     only_suspected = diagnosis.suspected and not diagnosis.identified
     sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
-        diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis))
+        diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis)
+        or _is_made_small(diagnosis))
     imitation = _imitated_in_words(diagnosis)
     if imitation and not _has_imitated(diagnosis):
         doubts.append(imitation)
@@ -250,7 +251,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
     step = _next(diagnosis)
     gross = diagnosis.gross_errors  # which says itself whether a factor explains the map as well
     factor = "" if gross else diagnosis.before.common_factor
-    if (factor or any(one.factor for one in gross)) and (not sound or _unusual(diagnosis)):
+    if _is_made_small(diagnosis) or ((
+            factor or any(one.factor for one in gross)) and (not sound or _unusual(diagnosis))):
         found = [factor] * bool(factor) + found
         step = ("Look at the unit, the sign and the factor of the readings and at the remanence "
                 "first, correct the map or the study, and diagnose again.", _again(diagnosis))
@@ -280,6 +282,9 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     if sound:
         return ("Yes: the readings are explained to their noise, with the blocks' tolerances "
                 "integrated out.")
+    if _is_made_small(diagnosis):
+        return ("No: so corrected the map agrees with the study far better than its noise allows, "
+                "as one does that a wrong unit has made too small.")
     if diagnosis.solver_error:
         return "No: the mesh is too coarse for readings of this noise."
     if diagnosis.unknown:
@@ -291,6 +296,14 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     if not _fails(diagnosis):
         return f"No. {diagnosis.after.held_out_conflict or 'The search did not come to rest.'}"
     return f"No: {chi2}."
+
+
+def _is_made_small(diagnosis: Diagnosis) -> bool:
+    """Tell whether a corrected map lies nearer to the model than its noise allows.
+
+    A quadrupole agrees at a thousandth of its lengths with a thousandth of its readings.
+    """
+    return bool(diagnosis.gross_errors and diagnosis.after.too_near)
 
 
 def _again(diagnosis: Diagnosis) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import halbach_fe as hf
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
 from halbach_fe.diagnosis.map_conventions import array_variants
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
@@ -325,3 +327,20 @@ def test_no_component_of_a_cross_section_is_put_along_z(yoked, generator, column
         # or positions that are mirrored, of which a quadrupole makes the same readings
         assert tuple(f"{'-' * (column < 0)}{'xyz'[abs(column) - 1]}"
                      for column in (*columns, 3)) in possible
+
+
+@pytest.mark.parametrize("unit_m", [1.0, 1e-3])
+def test_a_stated_unit_that_is_wrong_is_no_gross_error_of_the_map(unit_m):
+    """At a thousandth of its lengths a quadrupole has a thousandth of its field, so that readings
+    "in mT" agreed with it, beside a "Yes". Control: the right unit.
+    """
+    ring = hf.halbach_ring(order=2, blocks=8, inner_radius_m=0.05, outer_radius_m=0.09)
+    angle, radius = np.meshgrid(2 * np.pi * np.arange(24) / 24, (0.02, 0.033))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], -1)
+    points = points.reshape(-1, 3)
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(points.shape) * [1, 1, 0]
+    data = hf.field_map(points, ring.field_T(points) + noise, sigma_T=1e-4)
+    found = answer(hf.diagnose(ring.with_(instrument={"length_unit_m": unit_m}), data))
+    assert found.sound == (unit_m == 1)
+    assert ("a wrong unit has made too small" in found.trust) != found.sound
+    assert found.step.startswith("Look at the unit") != found.sound
