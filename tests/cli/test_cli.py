@@ -498,7 +498,10 @@ sys.exit(main(sys.argv[2:]))
 
 @pytest.mark.parametrize("extra_MiB", [100, 350, 500, 800])
 def test_memory_limit(study, measured, tmp_path, extra_MiB):
-    """Beyond what the program takes itself: whoever meets it says so, and nothing is broken."""
+    """Beyond what the program takes itself: whoever meets it says so, and nothing is broken.
+
+    Compiled libraries, those in Rust and C++, end the process themselves, with a sentence.
+    """
     out = tmp_path / "out"
     # Python that compiles a module without memory for its syntax tree calls that a ValueError.
     compileall.compile_dir(ROOT / "halbach_fe", quiet=1)
@@ -506,9 +509,10 @@ def test_memory_limit(study, measured, tmp_path, extra_MiB):
         [sys.executable, "-c", LIMITED, str(extra_MiB), "infer", str(study), "--measurements",
          str(measured), "-o", str(out)], env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode in (0, 7, 13), done.stderr
+    assert done.returncode in (0, 7, 13, -signal.SIGABRT), done.stderr
     if done.returncode:
-        assert re.search(r"not enough memory|Cannot allocate|out of memory", done.stderr)
+        assert re.search(r"not enough memory|Cannot allocate|out of memory"
+                         r"|memory allocation of \d+ bytes failed|bad_alloc", done.stderr)
         assert "Traceback" not in done.stderr
     assert not unreadable(out)
     assert extra_MiB > 100 or done.returncode, "the control: there is no run in so little"
