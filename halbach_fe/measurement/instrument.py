@@ -428,8 +428,9 @@ def field_at_sensors(
 ) -> tuple[Floats, Floats]:
     """Return B (n, 3, 3) in T and its gradient (n, 3, 3, 3) in T/m at sensors (n, 3, 3) in m.
 
-    The axes are point of the map, sensor, component of B, and direction. Between sensors that are
-    close together the field is taken for linear.
+    The axes are point of the map, sensor, component of B, and direction. B has no sources and no
+    curl where a probe is, so that its changes along x and y are those along z, too. Between sensors
+    that are close together the field is taken for linear.
     """
     # Distance of the sensors from their mean up to which the field is linear between them: in a
     # gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT.
@@ -438,11 +439,13 @@ def field_at_sensors(
     middle = sensors.mean(axis=1)
     apart = bool(np.abs(sensors - middle[:, None]).max() > close_m)
     places = sensors.reshape(-1, 3) if apart else middle
-    steps = DIFFERENCE_M * np.eye(3)
+    along = DIFFERENCE_M * np.eye(3)[:2]
     fields = field(np.concatenate([places, *(
-        places + sign * step for step in steps for sign in (1, -1))]))
-    here, around = fields[:len(places)], fields[len(places):].reshape(3, 2, -1, 3)
-    gradient = np.moveaxis(around[:, 0] - around[:, 1], 0, -1) / (2 * DIFFERENCE_M)
+        places + sign * step for step in along for sign in (1, -1))]))
+    here, around = fields[:len(places)], fields[len(places):].reshape(2, 2, -1, 3)
+    by_x, by_y = (around[:, 0] - around[:, 1]) / (2 * DIFFERENCE_M)
+    gradient = np.stack([by_x, by_y, np.column_stack(
+        [by_x[:, 2], by_y[:, 2], -by_x[:, 0] - by_y[:, 1]])], axis=-1)
     if not apart:
         here, gradient = np.repeat(here, 3, axis=0), np.repeat(gradient, 3, axis=0)
         here = here + np.einsum("nck,nk->nc", gradient, (sensors - middle[:, None]).reshape(-1, 3))
