@@ -480,9 +480,8 @@ class PoseFit:
 
         A wrong unit shows in it, which gains, blocks and offsets share out among them otherwise.
         """
-        sensors = sensor_positions(self.instrument(pose, values), self.points)
         exact = self.instrument(pose, np.append(np.zeros(PROBE), values[PROBE:]))
-        expected = seen(sensor_matrix(exact), field_at_sensors(self._field(values), sensors)[0])
+        expected = self._field(values)(self._middle(pose, values)) @ sensor_matrix(exact).T
         both = self.readings[self.training], expected[self.training]
         return factor_of(*both), likeness_of(*both)
 
