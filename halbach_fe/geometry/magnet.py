@@ -270,8 +270,8 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def middle_z_m(self) -> float:
-        """Place in m of the middle along z: 0 of rings, halfway between the ends of free blocks."""
-        if not self.array.free_blocks:
+        """Place in m of the middle along z: 0 of stacks of rings, else halfway between the ends."""
+        if not self.array.free_blocks and all(ring.z_m is None for ring in self.array.ring):
             return 0.0
         ends = [end for (along, _) in self.ring_sections for end in along]
         middle = (min(ends) + max(ends)) / 2
