@@ -405,7 +405,8 @@ TURN = ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg")
 
 def beside_blocks(magnet: Magnet) -> list[str]:
     """Return in words what a magnet has besides blocks, which no table of blocks contains."""
-    return [*(["iron"] if magnet.iron else []), *magnet.external.stated]
+    return [*(["iron"] if magnet.iron else []), *magnet.external.stated,
+            *(["irreversible losses"] if magnet.has_losses else [])]
 
 
 def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:

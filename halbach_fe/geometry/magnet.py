@@ -247,11 +247,17 @@ class Magnet(ShownInNotebook):
         return tuple(sections)
 
     @cached_property
+    def array_ends(self) -> tuple[float, float]:
+        """Smallest and largest z in m of the nominal blocks; infinite in 2D."""
+        if self.dimension == 2:
+            return -np.inf, np.inf
+        heights = np.concatenate([points[:, 2] for points in self._corners])
+        return float(heights.min()), float(heights.max())
+
+    @property
     def array_half_length(self) -> float:
         """Largest |z| in m of the nominal blocks; infinite in 2D."""
-        if self.dimension == 2:
-            return np.inf
-        return max(float(np.abs(points[:, 2]).max()) for points in self._corners)
+        return max(map(abs, self.array_ends))
 
     @cached_property
     def array_outer_radius(self) -> float:
@@ -270,14 +276,14 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def middle_z_m(self) -> float:
-        """Place in m of the middle along z: 0 of rings, halfway between the ends of free blocks."""
-        if not self.array.free_blocks:
+        """Place in m of the middle along z: 0 of stacks of rings, else halfway between the ends."""
+        stacked = not self.array.free_blocks and all(ring.z_m is None for ring in self.array.ring)
+        if self.dimension == 2 or stacked:
             return 0.0
-        ends = [end for (along, _) in self.ring_sections for end in along]
-        middle = (min(ends) + max(ends)) / 2
+        low, high = self.array_ends
         # what is left of blocks about z = 0 by rounding, relative to their length
         rounding = 1e-9
-        return 0.0 if abs(middle) < rounding * (max(ends) - min(ends)) else middle
+        return 0.0 if abs(low + high) / 2 < rounding * (high - low) else (low + high) / 2
 
     @cached_property
     def bore_radius(self) -> float:
@@ -506,6 +512,7 @@ def _built(study: Study) -> Magnet:
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
     _check_external(study)
     _doubt_metres(magnet)
+    _doubt_iron(magnet)
     return magnet
 
 
@@ -515,6 +522,18 @@ def _doubt_metres(magnet: Magnet) -> None:
     if look_like_mm(np.array([[reach, 0.0, 0.0]]))[0]:
         warnings.warn(f"Blocks of {magnet.name} reach {reach:.3g} m from the z axis. Are their "
                       "lengths in mm? Then write 0.01 for 10 mm.", HalbachWarning, stacklevel=3)
+
+
+def _doubt_iron(magnet: Magnet) -> None:
+    """Warn of iron that is as long as the array, whose middle is elsewhere."""
+    iron = magnet.study.iron
+    bodies = [magnet.study.iron_ring, *(iron.each if iron else ())]
+    if magnet.middle_z_m and any(getattr(body, "length_m", 0.0) is None for body in bodies):
+        low, high = magnet.array_ends
+        warnings.warn(
+            f"Iron of {magnet.name} has no length_m: it is {2 * max(-low, high):.4g} m long, about "
+            f"z = 0 or its z_m, and the blocks lie between z = {low:.4g} and {high:.4g} m. State "
+            "length_m, and z_m of a tube in iron.bodies.", HalbachWarning, stacklevel=3)
 
 
 def _check_external(study: Study) -> None:

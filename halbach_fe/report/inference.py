@@ -357,7 +357,7 @@ def page(result: InferenceResult) -> Page:
                     "Magnetic centre, axis and roll", about=axis),
             *sections_of_stray(stray, warning=doubtful),
             *sections_of_circles(
-                multipoles, result.study, "They are those of the readings on the circle about the "
+                multipoles, result.magnet, "They are those of the readings on the circle about the "
                 "axis of the magnet, where the study says that the map lies. With m readings, "
                 "order n would contain order m − n too; that part is subtracted, as the updated "
                 "blocks make it in vacuum. Their error bars take the solver's error of every "

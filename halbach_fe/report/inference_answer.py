@@ -72,8 +72,9 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
                if result.reservation else "Yes. Model")
     worst = max(result.regions_left_out, key=lambda one: one.over_noise, default=None)
     unseen = "" if worst is None or worst.in_words in verdict else f" {worst.in_words}."
+    main = main_field_in_words(tables, result.magnet) or _largest_field(result)
     return Answer(
-        question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
+        question, f"{main} {said}".lstrip(),
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
         f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}"

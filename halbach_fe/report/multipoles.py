@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import in_a_row
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
     POSTERIOR,
@@ -146,12 +147,13 @@ def _location(model: MultipoleModel) -> str:
     return "integrated" if model.integrated else "cross-section" if model.z is None else "local"
 
 
-def middle_circle(tables: Sequence[MultipoleTable]) -> MultipoleTable:
+def middle_circle(tables: Sequence[MultipoleTable], magnet: Magnet) -> MultipoleTable:
     """Return the circle nearest to the middle of the magnet, and of those the largest."""
-    return min(tables, key=lambda table: (abs(table[0].z or 0.0), -table[0].radius))
+    return min(tables, key=lambda table: (
+        abs((table[0].z or 0.0) - magnet.middle_z_m), -table[0].radius))
 
 
-def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
+def main_field_in_words(tables: Sequence[MultipoleTable], magnet: Magnet) -> str:
     """Say how strong the best known magnet's main multipole is; empty without tables.
 
     Of a dipole that is its field, of a quadrupole its gradient, of others the field at a radius. In
@@ -160,7 +162,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     """
     if not tables:
         return ""
-    model, magnets = middle_circle(tables)
+    model, magnets = middle_circle(tables, magnet)
     _, known = best_known(magnets)
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
     local = model.z is not None
@@ -177,7 +179,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
 
 
 def sections_of_circles(
-    tables: Sequence[MultipoleTable], study: Study, origin: str, error: str,
+    tables: Sequence[MultipoleTable], magnet: Magnet, origin: str, error: str,
     warning: Sequence[Text] = (),
 ) -> list[Section]:
     """Return what a page says of the multipoles of full circles; nothing without any.
@@ -186,14 +188,14 @@ def sections_of_circles(
     """
     if not tables:
         return []
-    model, magnets = middle_circle(tables)
+    model, magnets = middle_circle(tables, magnet)
     mains = "; ".join(f"{name} {main_in_words(model, known)}" for name, known in magnets.items())
-    nearest = " and the z nearest to 0" if study.dimension == 3 else ""
+    nearest = " and the z nearest to the middle" if magnet.dimension == 3 else ""
     others = "" if len(tables) == 1 else (
         f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
         f"its radius{nearest}.")
     return [Section([
-        *warning, f"{reference_text(model, study)}{error} Main multipole: {mains}. {origin}"
+        *warning, f"{reference_text(model, magnet.study)}{error} Main multipole: {mains}. {origin}"
         f"{others}", Table(text_table(**magnets), "numbers")], "Multipoles")]
 
 

@@ -60,7 +60,8 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
     size = np.linalg.norm(solution.flux_density, axis=1)
     low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
     equal = flux_density(low, 4) == flux_density(high, 4)
-    question, main = "How strong is the field?", main_field_in_words(tables)
+    question = "How strong is the field?"
+    main = main_field_in_words(tables, solution.magnet)
     said = (f"{main} At the study's {counted(len(size), 'position')} the nominal magnet makes "
             f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.").lstrip()
     of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
@@ -146,7 +147,7 @@ def page(solution: Solution) -> Page:
         "solve", "the nominal magnet", study, answer(solution, multipoles), solution.summary(), [
             Section([view]), Section([Table(rows)], "The field at the study's positions"),
             *sections_of_stray(solution.stray_field), *sections_of_circles(
-                multipoles, study, "They are those of the circle's own points. With m points, "
+                multipoles, magnet, "They are those of the circle's own points. With m points, "
                 "order n would contain order m − n too; that part is subtracted, as the blocks "
                 "make it in vacuum.", "" if not solution.errors.any() else
                 " ± is the standard deviation that the solver's error allows."),

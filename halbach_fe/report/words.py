@@ -215,13 +215,13 @@ def magnet_rows(magnet: Magnet) -> dict[str, str]:
              f"{_range((block.recoil_permeability_across for block in blocks), 3)}"),
             ("main multipole", str(array.multipole_order))]
     if magnet.dimension == 3:
-        rows.insert(3, ("length", f"{2e3 * magnet.array_half_length:.6g} mm"))
+        rows.insert(3, ("length", f"{1e3 * float(np.ptp(magnet.array_ends)):.6g} mm"))
     return dict([*rows, ("iron", iron_description(magnet))])
 
 
 def in_one_line(magnet: Magnet) -> str:
     """Return the magnet in a line: blocks, bore, length, remanence, iron."""
-    length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
+    length = (f", {1e3 * float(np.ptp(magnet.array_ends)):.4g} mm long" if magnet.dimension == 3
               else ", in cross-section")
     iron = "without iron" if iron_of(magnet.study) is None else f"iron: {iron_description(magnet)}"
     bore = f"bore {2e3 * magnet.free_radius:.4g} mm" if magnet.has_bore else "no bore"

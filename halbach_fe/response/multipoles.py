@@ -427,11 +427,11 @@ def circle_models(
     """Return the multipoles on the circles that a study reads, without a further solve.
 
     They include all orders that the readings resolve, the main order too, in units of the main
-    multipole on the circle of the same radius that is nearest to z = 0. The list is empty if the
-    study reads no full circles; if that main multipole is no larger than its error bar or than 3 %
-    of the largest at other z, as between the poles of an undulator; or if its instrument changes or
-    moves the readings: these are then not on circles about the magnet's axis, or at other z than
-    the map states. Circles within which a coil or a dipole is are left out.
+    multipole on the circle of the same radius that is nearest to the middle of the magnet. The list
+    is empty if the study reads no full circles; if that main multipole is no larger than its error
+    bar or than 3 % of the largest at other z, as between the poles of an undulator; or if its
+    instrument changes or moves the readings: these are then not on circles about the magnet's axis,
+    or at other z than the map states. Circles within which a coil or a dipole is are left out.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
     also contains (aliases with) order m - n, which the field of blocks in vacuum and of external
@@ -440,12 +440,16 @@ def circle_models(
     nominal magnet.
     """
     main, models = magnet.array.multipole_order, []
+
+    def from_middle(z: float) -> float:
+        return abs(z - magnet.middle_z_m)
+
     deviations, neighbours = Deviations.of(magnet), _of_neighbours_read(magnet, observation)
     circles = [(radius, z, analysis) for radius, z, analysis in _read_circles(magnet, observation)
                if not _source_within(magnet, radius, z)]
     for radius in sorted({radius for radius, _, _ in circles}):
         own = sorted((z, analysis) for other, z, analysis in circles if other == radius)
-        _, middle = min(own, key=lambda pair: abs(pair[0]))
+        _, middle = min(own, key=lambda pair: from_middle(pair[0]))
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
@@ -458,7 +462,7 @@ def circle_models(
             by_z[z] = _complexes(_seen(analysis, model.matrix)) - mistaken
             offsets[z] = _complexes(_seen(analysis, model.offset)) - of_others
             beside[z] = _complexes(_seen(analysis, neighbours)) - of_neighbours
-        reference, fixed, others = (each[min(by_z, key=abs)][main - 1:main]
+        reference, fixed, others = (each[min(by_z, key=from_middle)][main - 1:main]
                                     for each in (by_z, offsets, beside))
         try:
             # between the poles of an undulator 0.5 % of the largest were left of mesh and columns
@@ -582,7 +586,9 @@ def _turn(
             f"that of a magnet with a multipole of order {magnet.array.multipole_order}",
             "a magnet without it", "Check multipole_order and its exceptions; of an undulator, "
             "whose field cancels along z, ask on circles at poles: --at-z-m Z."))
-    return float(np.angle(own + external)) / magnet.array.multipole_order
+    angle, beside_pi = float(np.angle(own + external)), 0.1
+    # of pi and -pi, between which rounding decides, the axes of other orders may be opposite ones
+    return (angle + 2 * np.pi * (angle < beside_pi - np.pi)) / magnet.array.multipole_order
 
 
 def _read_circles(

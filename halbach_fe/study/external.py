@@ -26,9 +26,9 @@ from halbach_fe.study.types import (
 class Neighbour(StudyModel):
     """Another magnet with the same blocks, in vacuum, on the same axis.
 
-    Its middle is at ``z_m``; it is rotated by ``turn_deg`` about the axis, and its magnetizations
-    are those of this magnet multiplied by ``factor``. It must stand clear of this magnet and of
-    other neighbours, and needs a 3D study.
+    It is moved by ``z_m`` from where this magnet is, and rotated by ``turn_deg`` about the axis;
+    its magnetizations are those of this magnet multiplied by ``factor``. It must stand clear of
+    this magnet and of other neighbours, and needs a 3D study.
     """
 
     z_m: Place

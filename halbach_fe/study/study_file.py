@@ -360,43 +360,47 @@ def new_study(
     elif magnet.inner_radii_m:
         magnet = replace(magnet, rings=len(magnet.inner_radii_m),
                          inner_radius_m=min(magnet.inner_radii_m))
-    half = _half_length(magnet, table)
+    ends = _ends(magnet, table)
+    low, high = ends or (0.0, 0.0)
+    middle = round((low + high) / 2, 6) + 0.0
     around = 0.0  # radius of the points about a magnet that has no bore to measure in
     if table is not None and not bored and magnet.dsv_m is None:
-        around = AROUND * float(np.hypot(magnet.outer_radius_m, half or 0.0))
+        around = AROUND * float(np.hypot(magnet.outer_radius_m, (high - low) / 2))
     points = around or (magnet.dsv_m or 0.0) / 2
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe.study", "."), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     text = environment.get_template(TEMPLATE).render(
-        name=_name(name), magnet=magnet, table=table, half=half, around=around,
-        min_length=MIN_LENGTH_M,
-        sphere=_sphere(points, flat=half is None and around > 0) if points else [])
+        name=_name(name), magnet=magnet, table=table, solid=ends is not None, low=low, high=high,
+        middle=middle, around=around, min_length=MIN_LENGTH_M,
+        sphere=_sphere(points, middle, flat=ends is None and around > 0) if points else [])
     parse_new_study(text, folder, table)
     return text
 
 
-def _sphere(radius: float, flat: bool) -> list[str]:
-    """Return points on a sphere about the origin as TOML, a line for each of Gauss' latitudes.
+def _sphere(radius: float, middle: float, flat: bool) -> list[str]:
+    """Return points on a sphere about a ``middle`` on the z axis as TOML, a line for each of Gauss'
+    latitudes.
 
     If ``flat``, of a cross-section, they are those of the equator alone.
     """
     angle = 2 * np.pi * np.arange(ANGLES) / ANGLES
     lines = []
     for height in np.polynomial.legendre.leggauss(1 if flat else LATITUDES)[0]:
-        across = radius * np.sqrt(1 - height**2)
-        lines.append(", ".join(f"[{x:.5g}, {y:.5g}, {radius * height:.5g}]" for x, y in zip(
+        across, z = radius * np.sqrt(1 - height**2), middle + radius * height
+        lines.append(", ".join(f"[{x:.5g}, {y:.5g}, {z:.5g}]" for x, y in zip(
             (across * np.cos(angle)).round(9) + 0.0, (across * np.sin(angle)).round(9) + 0.0,
             strict=True)))
     return lines
 
 
-def _half_length(magnet: MagnetTemplate, table: FreeBlocks | None) -> float | None:
-    """Return the half length of the magnet in m, None for a cross-section."""
+def _ends(magnet: MagnetTemplate, table: FreeBlocks | None) -> tuple[float, float] | None:
+    """Return the lowest and the highest z of the magnet in m, None for a cross-section."""
     if table is not None:
-        return max(abs(z) + (size or 0.0) / 2 for z, size in zip(
-            table.z_m, table.size_z_m, strict=True)) if table.size_z_m else None
-    return None if magnet.ring_length_m is None else magnet.rings * magnet.ring_length_m / 2
+        z, half = table.numbers("z_m", 0.0), table.numbers("size_z_m", 0.0) / 2
+        return (float((z - half).min()), float((z + half).max())) if table.size_z_m else None
+    end = magnet.rings * (magnet.ring_length_m or 0.0) / 2
+    return (-end, end) if end else None
 
 
 def parse_new_study(text: str, folder: Path = Path(), table: FreeBlocks | None = None) -> Study:

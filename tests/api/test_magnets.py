@@ -110,6 +110,9 @@ def test_what_magpylib_leaves_out_is_said():
     for changes, said in (
             ({"array__recoil_permeability": 1.05}, "the permeability of the blocks of magnet"),
             ({"external__background_T": (0.0, 0.0, 1e-3)}, "the background"),
+            ({"demagnetization": {
+                "intrinsic_coercivity_A_per_m": 9e5, "remanence_coefficient_per_K": -0.0012,
+                "coercivity_coefficient_per_K": -0.006, "irreversible": True}}, "losses of magnet"),
             ({"iron_ring": {"inner_radius_m": 0.05, "outer_radius_m": 0.06,
                             "relative_permeability": 100.0},
               "external__coils": [{"kind": "round", "radius_m": 0.2, "current_A": 1.0}]},

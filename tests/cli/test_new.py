@@ -12,10 +12,13 @@ import pytest
 
 import halbach_fe as hf
 from halbach_fe.cli import main
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.words import in_one_line
+from halbach_fe.study.free_blocks import write_free_blocks
 from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.study_file import MagnetTemplate, new_study, parse_new_study
@@ -185,6 +188,29 @@ def test_spheres_that_are_no_volume_of_the_bore(tmp_path, capsys, options, code,
     assert found == code
     assert said in sentence
     assert not (tmp_path / "new.toml").exists()
+
+
+@pytest.mark.parametrize("away", [0.0, 0.3])
+def test_blocks_are_measured_where_they_are(tmp_path, away):
+    """Sphere and region were about the origin, 0.3 m beside these blocks, which were said to be
+    660 mm long. Iron without a length is as long, and about z = 0, which is said.
+    """
+    table, path = tmp_path / "blocks.csv", tmp_path / "study.toml"
+    ring = hf.halbach_ring(inner_radius_m=0.04, outer_radius_m=0.06, length_m=0.06, rings=2)
+    columns = blocks_table(ring)
+    write_free_blocks(columns | {"z_m": np.array(columns["z_m"]) + away}, table)
+    assert main(["new", str(path), "--free-blocks", str(table), "--dsv-m", "0.03"]) == 0
+    study = read_study(path)
+    magnet, middle = build_magnet(study), (0.0, 0.0, away)
+    assert study.homogeneity.centre_m == middle
+    np.testing.assert_allclose(np.linalg.norm(
+        points_from(study.observation.positions) - middle, axis=1), 0.015, rtol=1e-3)
+    assert ", 60 mm long," in in_one_line(magnet)
+    with pytest.warns(HalbachWarning, match=r"it is 0.66 m long") if away else (
+            contextlib.nullcontext()):
+        iron = magnet.with_(iron_ring={
+            "inner_radius_m": 0.07, "outer_radius_m": 0.08, "relative_permeability": 1000.0})
+    assert iron.with_(iron_ring__length_m=0.7)  # without a word
 
 
 def test_cubes_around_a_sphere_with_noise_that_suits_them(tmp_path):

@@ -16,7 +16,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import halbach_ring, magnet_of_blocks
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.multipoles import answer
+from halbach_fe.report.multipoles import answer, middle_circle
 from halbach_fe.response import multipoles
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
@@ -504,6 +504,43 @@ def test_circles_that_are_read(session, generator, quantity):
         b, a = known.mean.reshape(2, -1)
         np.testing.assert_allclose(b + 1j * a, UNITS * truth / main, atol=1e-4)
     assert models[3].of(exact).mean[0] < 0.8 * UNITS  # the ends are weaker
+
+
+def test_circles_are_in_units_of_the_one_in_the_middle_of_the_magnet():
+    """Those of rings that their z_m put elsewhere were in units of the field at an end, which the
+    answer took for that in the middle. Control: the field at that end.
+    """
+    def found(z):
+        magnet = build_magnet(study_of(dimension=3, array__ring_length_m=0.1, array__rings=2,
+            array__ring=[{"z_m": z}, {"z_m": z + 0.1}], observation={
+                "quantity": "flux_density", "positions": {
+                    "kind": "circles", "radius_m": 0.06, "angles": 16, "z_min_m": z - 0.1,
+                    "z_max_m": z + 0.2, "count": 7}}))
+        points = points_from(magnet.study.observation.positions)
+        tables = [(model, {"": known}) for model, known in solved_circles(
+            magnet, points, magnet.field_T(points), np.zeros(3 * len(points)))]
+        middle, known = middle_circle(tables, magnet)
+        return middle.z - z, known[""].main, tables[0][1][""].mean[0]
+
+    moved = found(0.1)
+    assert moved == pytest.approx(found(-0.05), rel=1e-9)
+    assert moved[0] == pytest.approx(0.05)
+    assert moved[2] < 0.5 * UNITS
+
+
+def test_a_negative_quadrupole_has_the_same_axes_on_all_circles(session):
+    """Rounding took some for turned by 90 degrees and others by -90, in whose axes odd orders have
+    opposite signs. Control: a quadrupole that is turned otherwise.
+    """
+    ring = halbach_ring(order=2, blocks=16, inner_radius_m=0.02, outer_radius_m=0.04)
+
+    def turns(angle):
+        magnet = ring.with_(array__first_magnetization_angle_deg=angle)
+        return [multipole_model(magnet, MultipoleReference(radius), session).turn
+                for radius in np.linspace(0.004, 0.015, 12).tolist()]
+
+    assert turns(90.0) == pytest.approx([-np.pi / 2] * 12)
+    assert turns(80.0) != pytest.approx([-np.pi / 2] * 12, abs=0.01)
 
 
 def test_a_main_multipole_that_is_lost_in_the_error_is_no_unit():
