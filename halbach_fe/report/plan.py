@@ -35,7 +35,9 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.point_maps import draw_cross_section
 from halbach_fe.report.words import counted, fraction, ppm
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
 
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
@@ -175,6 +177,14 @@ def _of_the_instrument(study: Study) -> str:
         "readings.")
 
 
+def _of_the_stage(instrument: Instrument) -> str:
+    """Say how a stage counts that is not in m, or along other axes than the magnet."""
+    own, unit = instrument.position_axes, instrument.length_unit_m
+    return "" if (own, unit) == (COMPONENTS, 1.0) else (
+        f" The stage's own x, y and z are {', '.join(own)} of these, in units of {unit:g} m, as "
+        "[instrument] of the study says.")
+
+
 def page(plan: MeasurementPlan) -> Page:
     """Return the page of the positions to measure."""
     magnet, summary, rows = plan.magnet, plan_summary(plan), plan_table(plan)
@@ -198,7 +208,8 @@ def page(plan: MeasurementPlan) -> Page:
                  f"the plan {1e-3 * rms(plan.planned_sd):.3g} kA/m (rms).", "small")]),
         Section([
             "In this order: if you stop early, what is measured tells most. plan.csv has them in "
-            "m, in the axes of the study.", Table(chosen, "numbers")],
+            f"m, in the axes of the study.{_of_the_stage(magnet.study.instrument)}",
+            Table(chosen, "numbers")],
             "The positions to measure", folded=len(chosen) > 30)],
         {title: rows},
         figures={

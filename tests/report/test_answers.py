@@ -812,6 +812,10 @@ def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tm
     text = (tmp_path / "plan.html").read_text()
     assert all(f">{row['x in mm']}<" in text for row in rows)
     assert "uncertainty that remains" not in text
+    assert "The stage's own" not in text
+    turned = plan.page(replace(found, magnet=found.magnet.with_(
+        instrument__position_axes=("y", "-x", "z"), instrument__length_unit_m=1e-3)))
+    assert "x, y and z are y, -x, z of these, in units of 0.001 m" in str(turned.sections)
     left, of_study = (plan.plan_table(found)[3][key] for key in ("plan", "the study's"))
     # each is rounded to 0.1 %
     assert float(left[:-2]) / float(of_study[:-2]) == pytest.approx(found.volume_ratio, abs=3e-3)
