@@ -499,12 +499,12 @@ def field(
     known = (study_prior(magnet, len(nominal_parameters(magnet))) if posterior is None
              else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
-    most, nothing_T = 0.01, 1e-12  # a smaller field is rounding, as on the axis of a quadrupole
-    if (spacing := found.relative_spacing) > most and np.abs(found.mean).max() > nothing_T:
+    most = 0.01
+    if (spacing := found.relative_spacing) > most:
+        of_it = f"{100 * spacing:.2g} % of" if spacing < 1 else "more than"
         warnings.warn(f"The {lines.count} points of a line are too far apart for its integrals: "
-                      f"that makes {100 * spacing:.2g} % of the integral of |B|, which is in "
-                      "their error bars. Take more points (--count), or shorter lines.",
-                      HalbachWarning, stacklevel=2)
+                      f"that makes {of_it} the integral of |B|, which is in their error bars. Take "
+                      "more points (--count), or shorter lines.", HalbachWarning, stacklevel=2)
     return replace(found, measured=posterior is not None,
                    disagreement=disagreement_of(posterior, magnet))
 

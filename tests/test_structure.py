@@ -29,11 +29,12 @@ ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
            "magpylib": "", "ngsolve": "", "netgen": ""}
 
 # Statistics see arrays only; the closed form is an oracle; and a synthetic campaign tests the model
-# of the field, so it must not come from it.
+# of the field, so it must not come from it: of geometry it may ask whether its own bodies overlap.
 MAY_IMPORT = {
     "stats": ("core",), "solver.ring_harmonics_2d": ("core",),
     "synthetic": ("core", "study", "measurement.field_map", "measurement.block_table",
-                  "measurement.positions", "measurement.reading_noise")}
+                  "measurement.positions", "measurement.reading_noise", "geometry.convex_pieces",
+                  "geometry.outline", "geometry.overlaps", "geometry.surface")}
 
 
 def imports(path):

@@ -37,6 +37,7 @@ from halbach_fe.geometry.coils import (
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import at_heights, points_on
 from halbach_fe.geometry.overlaps import (
+    SQUEEZED,
     block_in_iron,
     block_in_others,
     overlapping_blocks,
@@ -52,10 +53,6 @@ from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 SOLVED_BY = "halbach_fe.solver.routes"
 """The module that solves for the field of a magnet."""
-
-SQUEEZED = 0.1
-"""The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
-makes neighbours overlap a little; a larger overlap cannot be a tolerance of the assembly."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,11 @@ ALLOWED_PENETRATION = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant
 digits, and the rounding of rotations (1e-15), stay below it."""
 
+SQUEEZED = 0.1
+"""The same for blocks that exceptions, or hidden faults, displace or rotate. In a ring without gaps
+any displacement makes neighbours overlap a little; a larger overlap cannot be a tolerance of the
+assembly."""
+
 
 def overlapping_blocks(
     blocks: Sequence[MagnetBlock], tolerance: float = ALLOWED_PENETRATION
@@ -52,7 +57,7 @@ def overlapping_blocks(
     ValueError
         If an infinite block is tilted.
     """
-    return _first_overlap(_block_bodies(blocks), None, tolerance) if blocks else None
+    return first_overlap(_block_bodies(blocks), None, tolerance) if blocks else None
 
 
 def block_in_others(
@@ -62,7 +67,7 @@ def block_in_others(
     """Return the first of some blocks that overlaps one of others, as `block_in_iron` does."""
     if not (blocks and others):
         return None
-    return _first_overlap(_block_bodies(blocks), _block_bodies(others), tolerance)
+    return first_overlap(_block_bodies(blocks), _block_bodies(others), tolerance)
 
 
 def block_in_iron(
@@ -97,11 +102,11 @@ def block_in_iron(
         return None
     shapes = [annulus(body.inner_radius, body.outer_radius) if body.outline is None
               else Shape(body.outline) for body in iron]
-    bodies = _Bodies(shapes, np.arange(len(iron)),
+    bodies = Bodies(shapes, np.arange(len(iron)),
                      np.array([[body.z_min, body.z_max] for body in iron]),
                      np.array([rotation_matrix(body.turn_rad) for body in iron]),
                      np.array([body.origin_m for body in iron]))
-    found = _first_overlap(_block_bodies(blocks), bodies, tolerance)
+    found = first_overlap(_block_bodies(blocks), bodies, tolerance)
     return None if found is None else (found[0], numbers[found[1]], found[2])
 
 
@@ -163,7 +168,7 @@ def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Bodies:
+class Bodies:
     """Prisms with their poses."""
 
     shapes: list[Shape]
@@ -236,7 +241,7 @@ class _Bodies:
         return found
 
 
-def _block_bodies(blocks: Sequence[MagnetBlock]) -> _Bodies:
+def _block_bodies(blocks: Sequence[MagnetBlock]) -> Bodies:
     """Return the bodies of blocks."""
     numbers: dict[Outline, int] = {}
     shape = np.array([numbers.setdefault(block.outline, len(numbers)) for block in blocks], int)
@@ -248,16 +253,20 @@ def _block_bodies(blocks: Sequence[MagnetBlock]) -> _Bodies:
     if tilted.any():
         raise ValueError(f"block {blocks[int(np.argmax(tilted))].name} is infinitely long and "
                          "tilted; it may turn about z only")
-    return _Bodies(shapes, shape, limits, axes, position)
+    return Bodies(shapes, shape, limits, axes, position)
 
 
-def _first_overlap(
-    first: _Bodies, second: _Bodies | None, tolerance: float
+def first_overlap(
+    first: Bodies, second: Bodies | None, tolerance: float
 ) -> tuple[int, int, float] | None:
-    """Return the first pair of overlapping bodies; within ``first`` if ``second`` is None."""
+    """Return the first pair of overlapping bodies; within ``first`` if ``second`` is None.
+
+    Tolerance and result are those of `overlapping_blocks`.
+    """
     i, j = _near(first, second)
     other = first if second is None else second
-    allowed = tolerance * np.minimum(first.size[i], other.size[j])
+    size = np.minimum(first.size[i], other.size[j])
+    allowed, touching = tolerance * size, min(tolerance, ALLOWED_PENETRATION) * size
     exact = ~np.isnan(first.polar[i, 0]) & ~np.isnan(other.polar[j, 0])
     smallest = 2 * min(first.size.min(initial=np.inf), other.size.min(initial=np.inf))
 
@@ -277,28 +286,28 @@ def _first_overlap(
     cost = np.where(exact, 1, mine.effort[first.shape[i]] * others.effort[other.shape[j]])
     pairs_at_once = 20_000  # number of pairs of pieces that are compared at once
     lump = np.cumsum(cost) // pairs_at_once
-    # larger values of it, for the depth of an overlap that is already found: fewer and larger
-    # pieces measure deep overlaps better, since a penetration cannot exceed the width of a piece
+    # larger values of it, for the depth of bodies that penetrate at all: fewer and larger pieces
+    # measure deep overlaps better, since a penetration cannot exceed the width of a piece
     coarse_errors = (1e-3, 3e-2)
     for pairs in np.split(np.arange(len(i)), np.flatnonzero(np.diff(lump)) + 1):
         depth = np.zeros(len(pairs))
         flat = exact[pairs]
         depth[flat] = _polar_depth(first.polar[i[pairs[flat]]], other.polar[j[pairs[flat]]])
         rest = pairs[~flat]
-        depth[~flat] = _depth(mine, i[rest], others, j[rest], allowed[rest])
+        depth[~flat] = _depth(mine, i[rest], others, j[rest], touching[rest])
+        meet = np.flatnonzero(~flat & (depth > touching[pairs]))
+        for chords in coarse_errors if len(meet) else ():
+            some = pairs[meet]
+            a, b = pieces(chords, some)
+            depth[meet] = np.maximum(depth[meet], _depth(a, i[some], b, j[some], touching[some]))
         found = np.flatnonzero(depth > allowed[pairs])
-        if not len(found):
-            continue
-        pair, deepest = pairs[found[:1]], float(depth[found[0]])
-        if not exact[pair[0]]:
-            for chords in coarse_errors:
-                a, b = pieces(chords, pair)
-                deepest = max(deepest, float(_depth(a, i[pair], b, j[pair], allowed[pair])[0]))
-        return int(i[pair[0]]), int(j[pair[0]]), deepest
+        if len(found):
+            pair = int(pairs[found[0]])
+            return int(i[pair]), int(j[pair]), float(depth[found[0]])
     return None
 
 
-def _near(first: _Bodies, second: _Bodies | None) -> tuple[Ints, Ints]:
+def _near(first: Bodies, second: Bodies | None) -> tuple[Ints, Ints]:
     """Return the pairs of bodies whose bounding spheres overlap, (m,) and (m,), in their order.
 
     Trees are built of bodies of similar size, each within a factor of 2, so that a few large ones
@@ -339,7 +348,7 @@ def _near(first: _Bodies, second: _Bodies | None) -> tuple[Ints, Ints]:
 
 
 def _polar_depth(first: Floats, second: Floats) -> Floats:
-    """Return how far sectors about the z axis penetrate, (m,) in m, from rows of `_Bodies.polar`.
+    """Return how far sectors about the z axis penetrate, (m,) in m, from rows of `Bodies.polar`.
 
     It is the smallest one of their overlaps in radius, along the arc and in z.
     """
@@ -354,7 +363,7 @@ class _Pieces:
 
     Attributes
     ----------
-    bodies : _Bodies
+    bodies : Bodies
     first, count : ndarray, shape (shapes,)
         Number of the first piece of every shape, and how many it has.
     effort : ndarray, shape (shapes,)
@@ -367,7 +376,7 @@ class _Pieces:
         Corners (m, corners, 2) in m, and the different directions of edges (m, directions, 2).
     """
 
-    def __init__(self, bodies: _Bodies, needed: Ints, chords: float, smallest: float) -> None:
+    def __init__(self, bodies: Bodies, needed: Ints, chords: float, smallest: float) -> None:
         self.bodies = bodies
         self.count = np.zeros(len(bodies.shapes), int)
         self.effort = np.zeros(len(bodies.shapes), int)
@@ -433,7 +442,7 @@ def _depth(first: _Pieces, i: Ints, second: _Pieces, j: Ints, allowed: Floats) -
     return depth
 
 
-def _reachable_pieces(first: _Bodies, i: Ints, second: _Bodies, j: Ints,
+def _reachable_pieces(first: Bodies, i: Ints, second: Bodies, j: Ints,
                   count: Ints) -> tuple[Ints, Ints]:
     """Return the first piece, and how many, of second bodies that first bodies can touch, (m,).
 

@@ -42,6 +42,11 @@ def answer(found: FieldOnLines) -> Answer:
             f"integrals along {_which(found)} are "
             + ", ".join(row["first integral, T m"] for row in rows)
             + " T m for Bx, By, Bz.")
+    if unknown := found.without_integrals:
+        return Answer(
+            question, said, f"Only the field at the points, not its integrals: {unknown}.",
+            "Take more points with --count, or a shorter line.",
+            "halbach-fe field STUDY --from-m X Y Z --to-m X Y Z --count N -o DIR", sound=False)
     if not found.measured:
         return Answer(
             question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "

@@ -194,9 +194,26 @@ class FieldOnLines(ShownInNotebook):
 
     @property
     def relative_spacing(self) -> float:
-        """The largest `spacing`, relative to the largest integral of |B|."""
-        return float(self.spacing.max() / self._integrated(
-            np.linalg.norm(self.mean, axis=2))[:, -1].max())
+        """The largest `spacing`, relative to the largest integral of |B|.
+
+        It is 0 where the field is nothing but rounding, as on the axis of a quadrupole.
+        """
+        nothing_T = 1e-12
+        if np.abs(self.mean).max() <= nothing_T >= self.spacing.max() / self.lines.length:
+            return 0.0
+        whole = self._integrated(np.linalg.norm(self.mean, axis=2))[:, -1].max()
+        return float(self.spacing.max() / max(whole, nothing_T * self.lines.length))
+
+    @property
+    def without_integrals(self) -> str:
+        """Say that the points are too far apart for the integrals to be known, or nothing."""
+        known = 0.1  # part of the integral of |B|, up to which an error bar may stand beside it
+        share = self.relative_spacing
+        if share <= known:
+            return ""
+        of_it = f"{100 * share:.2g} % of" if share < 1 else "more than"
+        return (f"the {self.lines.count} points of a line are too far apart, which makes an error "
+                f"of {self.spacing.max():.2g} T m, {of_it} the integral of |B|")
 
     def _integrated(self, values: Floats, order: int = 1) -> Floats:
         """Return the integrals (lines, count, ...) from the start of a line to every point."""

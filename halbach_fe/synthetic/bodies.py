@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.array import Array, BlockException
+from halbach_fe.study.external import Neighbour
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
@@ -28,14 +29,7 @@ from halbach_fe.synthetic.shapes import (
     Shape,
     shoelace,
 )
-from halbach_fe.synthetic.true_magnet import (
-    Body,
-    BodyPart,
-    TrueMagnet,
-    VacuumNeighbour,
-    iron_of_study,
-    vector,
-)
+from halbach_fe.synthetic.true_magnet import Body, BodyPart, TrueMagnet, iron_of_study, vector
 
 
 def free_bodies(array: Array, dimension: int) -> tuple[Body, ...]:
@@ -248,12 +242,21 @@ def magnet_of(study: Study) -> TrueMagnet:
         raise StudyError(must_be("`external.coils`", f"study {study.name}",
                                  "left out to simulate a campaign", "given",
                                  "The field of the magnet can be computed with them."))
+    bodies = mounted(bodies, array.exceptions)
     return replace(
-        nominal, bodies=mounted(bodies, array.exceptions),
+        nominal, bodies=bodies,
         iron=iron_of_study(study, nominal.half_length), background=external.background_T,
-        neighbours=tuple(VacuumNeighbour(each.z_m, float(np.radians(each.turn_deg)), each.factor)
-                         for each in external.neighbours),
+        neighbours=tuple(body for each in external.neighbours
+                         for body in beside_magnet(each, bodies)),
         dipoles=tuple((each.position_m, each.moment_A_m2) for each in external.dipoles))
+
+
+def beside_magnet(neighbour: Neighbour, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Return the blocks of a magnet where a neighbour has them, with their remanences there."""
+    turn = float(np.radians(neighbour.turn_deg))
+    return tuple(replace(
+        body.turned(turn).lifted(neighbour.z_m),
+        remanence=vector(neighbour.factor * np.array(body.remanence))) for body in bodies)
 
 
 def _ring_middles(array: Array, rings: list[Array], dimension: int) -> list[float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.metadata import version as version_of
@@ -35,14 +35,15 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.bodies import beside_magnet, magnet_of
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
+    doubt_size,
     instrument_with,
     with_effects,
 )
-from halbach_fe.synthetic.hidden_effects.effect_types import site_of
+from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, Site, site_of
 from halbach_fe.synthetic.hidden_effects.instrument_effects import (
     IDEAL_AXES,
     FaultyInstrument,
@@ -59,7 +60,16 @@ from halbach_fe.synthetic.reaction import (
     reaction_field,
 )
 from halbach_fe.synthetic.shapes import Shape
-from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Body, TrueMagnet, in_places, vector
+from halbach_fe.synthetic.true_magnet import (
+    ZERO_VECTOR,
+    Body,
+    TrueMagnet,
+    check_room,
+    distance_from,
+    in_places,
+    in_words,
+    vector,
+)
 
 COIL_SD = 0.001
 """Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""
@@ -170,7 +180,7 @@ def simulate_campaign(
                                  "flux_density for a map of |B|", study.observation.quantity))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]), magnitude)
-    blocks, coil, noise, effects, faults = _streams(seed)
+    blocks, coil, noise, effects, faults = streams(seed)
     nominal = magnet_of(study)
     site = replace(site_of(study, nominal), is_of_length=magnitude)
     hidden = choose_effects(site, hide, hide_random, effects)
@@ -180,7 +190,10 @@ def simulate_campaign(
     if placed is not None:
         drawn, table = replace(drawn, single=in_places(drawn.single, table, placed)), placed
     mounted = drawn.mounted
-    magnet, instrument = with_effects(mounted, site, hidden), instrument_with(site, hidden)
+    magnet, instrument = with_hidden(study, mounted, hidden, site, seed), instrument_with(
+        site, hidden)
+    for asked in hidden[:len(hide)]:
+        doubt_size(site, asked)
     nominal_places = np.vstack([points, others])
     check_apart(study.external, nominal_places, study.name)
     offsets = real_places(study, nominal_places, noise) - nominal_places
@@ -197,12 +210,14 @@ def simulate_campaign(
         "coil_calibration": calibration, "coil_sd": coil_sd,
         "noise_free": {"largest_T": float(np.linalg.norm(readings, axis=1).max()),
                        "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
-        "blocks": magnetizations(mounted),
+        "blocks": magnetizations(mounted.bodies),
     }
+    if magnet.neighbours:
+        truth["blocks_of_neighbours"] = magnetizations(magnet.neighbours)
     if stated := study.instrument.model_dump(mode="json", exclude_defaults=True):
         truth["stated_instrument"] = stated
     if magnet.bodies != mounted.bodies:
-        truth["blocks_with_effects"] = magnetizations(magnet)
+        truth["blocks_with_effects"] = magnetizations(magnet.bodies)
     seal = {"source": "synthetic", "study": study.name, "halbach_fe": version_of("halbach-fe"),
             "truth_sha256": hashlib.sha256(truth_text(truth).encode()).hexdigest()}
     unit, exact = instrument.field_unit, readings[:len(points)].copy()
@@ -237,12 +252,12 @@ def _warn_of_elements(
 
 def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:
     """Return the measured single blocks of `simulate_campaign`, without hidden effects or a map."""
-    blocks, coil, *_ = _streams(seed)
+    blocks, coil, *_ = streams(seed)
     nominal = magnet_of(study)
     return coil_table(study, nominal, draw_magnet(study, nominal, blocks).single, coil_sd, coil)[0]
 
 
-def _streams(seed: int) -> list[np.random.Generator]:
+def streams(seed: int) -> list[np.random.Generator]:
     """Return separate streams of random numbers for blocks, coil, noise, effects and instrument.
 
     A further draw from one does not change the others.
@@ -271,19 +286,112 @@ def measured(
         places = places + Rotation.from_rotvec(stated.rotation_rad).apply(offsets)
     # the three sensors are usually in one place, whose field is then computed once
     distinct, inverse = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
-    check_air(magnet, distinct)
+    check_air(magnet, places, len(points))
     fields = true_field(magnet, distinct, elements, progress)[inverse].reshape(places.shape)
     time = np.arange(len(nominal)) / max(1, len(points) - 1)
-    if magnitude:  # a length has no axes: it is as the reading of a single sensor of Bx
-        fields = np.linalg.norm(fields, axis=2)[..., None] * [1.0, 0.0, 0.0]
+    if magnitude:
+        fields, instrument = _lengths(fields, instrument)
         stated = stated.model_copy(update={"rotation_rad": ZERO_VECTOR})
-        instrument = replace(instrument, rotation=ZERO_VECTOR, axes=IDEAL_AXES,
-                             order=(0, 1, 2), signs=(1.0, 1.0, 1.0))
     if stated != IDEAL:
         fields = _as_stated(stated, fields, [len(part) for part in maps])
     recorded, readings = instrument.record(
         nominal, instrument.readings(fields, time, generator))
     return recorded, readings.round(DIGITS)[:, :1 if magnitude else 3]
+
+
+def with_hidden(
+    study: Study, before: TrueMagnet, hidden: Sequence[ChosenEffect], site: Site, seed: int
+) -> TrueMagnet:
+    """Return a magnet with hidden effects.
+
+    Raises
+    ------
+    StudyError
+        If they move something to where something is already, or one of them changes no reading of
+        the map.
+    """
+    magnet = with_effects(before, site, hidden)
+    if hidden:
+        check_room(magnet, before)
+        _check_seen(study, before, magnet, hidden, site, seed)
+    return magnet
+
+
+def _check_seen(
+    study: Study, before: TrueMagnet, magnet: TrueMagnet, hidden: Sequence[ChosenEffect],
+    site: Site, seed: int,
+) -> None:
+    """Raise a StudyError if one of the hidden effects changes no reading of the map.
+
+    An effect of the magnet is looked for in the field of its sources in vacuum at some of the
+    points; what it does to materials that answer counts as a change. For an effect of the
+    instrument it is the readings of a field without symmetry, of the magnet's size.
+
+    Parameters
+    ----------
+    before, magnet : TrueMagnet
+        The magnet without and with all effects.
+    """
+    unseen = 1e-3  # of the noise: 1e5 readings together do not show it
+    compared = 200  # largest number of points at which the effects of the magnet are looked for
+    points = points_from(study.observation.positions)
+    sigma = point_noise(study, points, site.is_of_length)
+    some = np.unique(np.linspace(0, len(points) - 1, compared).astype(int))
+
+    def field(one: TrueMagnet, but: Collection[Body] = ()) -> Floats:
+        """Return B at some points of a magnet in vacuum, without the blocks that another has."""
+        found = true_field(replace(one.in_vacuum, bodies=tuple(
+            body for body in one.in_vacuum.bodies if body not in but)), points[some])
+        return np.linalg.norm(found, axis=1)[:, None] if site.is_of_length else found
+
+    size = float(np.abs(field(before)).max()) or 1.0
+    slopes = size * np.random.default_rng(0).uniform(-1, 1, (3, 4))
+    slopes[magnet.dimension:] = slopes[:, magnet.dimension:3] = 0.0
+
+    def shown(effects: Sequence[ChosenEffect]) -> Floats:
+        """Return recorded points and readings of the field without symmetry, over the noise."""
+        instrument, generator = instrument_with(site, effects), streams(seed)[4]
+        places = instrument.places(points, generator)
+        fields = places @ slopes[:, :3].T / site.outer + slopes[:, 3]
+        if site.is_of_length:
+            fields, instrument = _lengths(fields, instrument)
+        recorded, readings = instrument.record(points, instrument.readings(
+            fields, np.linspace(0.0, 1.0, len(points)), generator))
+        return np.hstack([recorded / site.outer, readings[:, :sigma.shape[1]] / sigma])
+
+    def changed(one: ChosenEffect) -> bool:
+        """Tell whether the readings are others with an effect than with all others alone."""
+        others = [each for each in hidden if each is not one]
+        if one.effect.instrument is not None:
+            return bool((np.abs(shown(hidden) - shown(others)) > unseen).any())
+        if one.effect.name == "knee":  # which takes minutes
+            change = lost_field(magnet.losses, points[some])
+        else:
+            now, without = (with_effects(before, site, [
+                each for each in effects if each.effect.name != "knee"])
+                for effects in (hidden, others))
+            if now.answers != without.answers:
+                return True
+            same = ({*now.in_vacuum.bodies} & {*without.in_vacuum.bodies}
+                    if not (now.objects or site.is_of_length) else ())
+            change = field(now, same) - field(without, same)
+        return bool((np.abs(change) > unseen * sigma[some]).any())
+
+    for one in hidden:
+        if not changed(one):
+            values = ", ".join(f"{value:g}" for value in one.values)
+            raise StudyError(must_be(
+                f"--hide {one.effect.name}", "the study", "an effect that readings of the map show",
+                f"{f'{values}, which' if values else 'one that'} changes none of them by a "
+                "thousandth of its noise", "Choose another place or value, or leave it out."))
+
+
+def _lengths(
+    fields: Floats, instrument: FaultyInstrument
+) -> tuple[Floats, FaultyInstrument]:
+    """Return |B|, and the instrument that reads it: as the single sensor of Bx, without axes."""
+    return np.linalg.norm(fields, axis=2)[..., None] * [1.0, 0.0, 0.0], replace(
+        instrument, rotation=ZERO_VECTOR, axes=IDEAL_AXES, order=(0, 1, 2), signs=(1.0, 1.0, 1.0))
 
 
 def _as_stated(stated: Instrument, fields: Floats, counts: Sequence[int]) -> Floats:
@@ -316,11 +424,7 @@ def true_field(
 
 def _external_field(magnet: TrueMagnet, points: Floats, progress: Progress) -> Floats:
     """Return B (n, 3) in T of the sources outside the magnet, to which nothing reacts."""
-    field = np.tile(magnet.background, (len(points), 1)).astype(float)
-    for neighbour in magnet.neighbours:
-        turn = Rotation.from_euler("z", neighbour.turn)
-        seen = turn.inv().apply(points - [0.0, 0.0, neighbour.shift])
-        field += neighbour.factor * turn.apply(vacuum_field(magnet.bodies, seen, progress))
+    field = magnet.background + vacuum_field(magnet.neighbours, points, progress)
     for place, moment in magnet.dipoles:
         field += moment_field(np.array([place]), MU_0 * np.array([moment]), points)
     return field
@@ -384,21 +488,44 @@ def real_places(study: Study, points: Floats, generator: np.random.Generator) ->
     return np.asarray(points + sd * generator.standard_normal(points.shape))
 
 
-def check_air(magnet: TrueMagnet, points: Floats) -> None:
-    """Raise a StudyError if a point (n, 3) in m is inside a block or iron, or on its surface."""
+def check_air(magnet: TrueMagnet, places: Floats, count: int) -> None:
+    """Raise a StudyError if a place (..., n, 3) in m of a sensor is in or on blocks or iron.
+
+    The first ``count`` of the n readings are those of the map, the others are held out.
+    """
     # Distance in m from a surface up to which a point is on it: rounding errors of the coordinates
     # of turned bodies are less, and magpylib's field jumps by the remanence within them.
     surface_m = 1e-9
+    points = places.reshape(-1, 3)
     inside = magnet.holds(points)
     for beside in np.vstack([np.eye(3), -np.eye(3)]) * surface_m:
         inside |= magnet.holds(points + beside)
+
+    def at(number: int) -> str:
+        reading, (x, y, z) = number % places.shape[-2], points[number]
+        name = (f"reading {reading + 1} of the map" if reading < count else
+                f"held-out reading {reading - count + 1}")
+        return f"{name} at ({x:g}, {y:g}, {z:g}) m"
+
     if inside.any():
-        x, y, z = points[int(np.argmax(inside))]
+        first = int(np.argmax(inside))
+        deep, body = max((-float(distance_from(solid, points[[first]], magnet.dimension)[0]),
+                          in_words(solid)) for solid in magnet.solids)
+        where = f"{1e3 * deep:.3g} mm inside" if deep > surface_m else "on the surface of"
         raise StudyError(must_be(
             "`observation.positions`", "the study", "in air, as must the held-out points halfway "
             "between them and the points to which hidden effects take the probe",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron or on its surface",
-            "Move it off by a micrometre or more."))
+            f"{at(first)}, {where} {body}",
+            f"Move it off by {1e3 * max(deep, 1e-6):.3g} mm or more."))
+    for sphere in magnet.objects:
+        away = np.linalg.norm(points - sphere.place, axis=1)
+        if away.min() <= sphere.radius:
+            raise StudyError(must_be(
+                "--hide ferromagnetic_object", "the study", "a sphere that no probe touches",
+                f"one of radius {1e3 * sphere.radius:.3g} mm, whose middle is "
+                f"{1e3 * away.min():.3g} mm from {at(int(np.argmin(away)))}",
+                "Move it away from all readings by more than its radius, or make its volume "
+                "smaller."))
 
 
 def _map(
@@ -499,12 +626,23 @@ class DrawnMagnet:
 
 
 def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
-    """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
+    """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior.
+
+    Blocks of neighbouring magnets are others, with deviations of their own.
+    """
+    own = _drawn(study, nominal.bodies, generator)
+    beside = tuple(body for each in study.external.neighbours for body in beside_magnet(
+        each, _drawn(study, nominal.bodies, generator).mounted.bodies))
+    return replace(own, single=replace(nominal, bodies=own.single.bodies, neighbours=beside))
+
+
+def _drawn(study: Study, nominal: tuple[Body, ...], generator: np.random.Generator) -> DrawnMagnet:
+    """Draw the blocks of the magnet or of a neighbour."""
     prior = study.prior
     shared = study.shared_sds
     common = (shared * generator.standard_normal(shared.shape[1])).sum(axis=1)
     single, turns = [], []
-    for body, together in zip(nominal.bodies, common, strict=True):
+    for body, together in zip(nominal, common, strict=True):
         deviation = generator.standard_normal(3) * [
             prior.magnitude_sd, *2 * [np.radians(prior.direction_sd_deg)]]
         turn = np.radians(prior.mounting_sd_deg) * generator.standard_normal(3)
@@ -512,7 +650,7 @@ def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generato
             deviation[2] = turn[0] = turn[1] = 0.0
         single.append(_deviating(body, deviation + np.array([together, 0.0, 0.0])))
         turns.append(Rotation.from_rotvec(turn))
-    return DrawnMagnet(replace(nominal, bodies=tuple(single)), tuple(turns), common)
+    return DrawnMagnet(TrueMagnet(study.dimension, tuple(single)), tuple(turns), common)
 
 
 def _deviating(body: Body, deviation: Floats) -> Body:
@@ -591,8 +729,8 @@ def _before_mounting(magnet: TrueMagnet, numbers: Iterable[int]) -> tuple[Body, 
                  for body in (magnet.bodies[number] for number in numbers))
 
 
-def magnetizations(magnet: TrueMagnet) -> list[dict[str, object]]:
+def magnetizations(bodies: Sequence[Body]) -> list[dict[str, object]]:
     """Return the magnetization of every block, in A/m, as plain data."""
     return [{"ring": body.ring, "slot": body.slot,
              "magnetization_A_per_m": list(vector(body.magnetization.round(6)))}
-            for body in magnet.bodies]
+            for body in bodies]

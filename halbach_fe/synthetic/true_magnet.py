@@ -8,15 +8,20 @@ remanences in T. Iron has a material law, and is in tubes, prisms and balls in a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.arrays import Bools, Floats, unit_circle
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.geometry import convex_pieces
+from halbach_fe.geometry.outline import circle, closed_outline
+from halbach_fe.geometry.overlaps import SQUEEZED, Bodies, first_overlap
+from halbach_fe.geometry.surface import distance_from_prism, distance_from_tube
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study import materials
 from halbach_fe.study.external import External
@@ -24,6 +29,7 @@ from halbach_fe.study.iron import Iron, IronMaterial
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.shapes import (
+    HALF_TURN,
     CylinderBody,
     Fractions,
     PolygonBody,
@@ -175,6 +181,23 @@ class Body:
         own = self.orientation.inv().apply(magnetization)
         return replace(self, remanence=vector(MU_0 * self.permeability @ own))
 
+    @property
+    def room(self) -> tuple[object, ...]:
+        """What tells whether it takes the same room as another body."""
+        return (self.shape, self.angle, self.centre, self.displacement, self.rotation, self.seat,
+                any(self.remanence))
+
+    def turned(self, angle: float) -> Body:
+        """Return the body in its place in a magnet that is turned by ``angle`` rad about z."""
+        turn = Rotation.from_euler("z", angle)
+        return replace(self, angle=self.angle + angle, centre=vector(turn.apply(self.centre)),
+                       displacement=vector(turn.apply(self.displacement)),
+                       rotation=vector(turn.apply(self.rotation)))
+
+    def lifted(self, shift: float) -> Body:
+        """Return the body at another nominal place, ``shift`` m along z."""
+        return replace(self, centre=vector(np.add(self.centre, (0, 0, shift))))
+
     def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
         near = np.linalg.norm(points - self.position, axis=1) <= self.shape.reach * (1 + 1e-9)
@@ -200,9 +223,14 @@ class Body:
 
 @dataclass(frozen=True)
 class MagnetCopy:
-    """A second magnet like the first, displaced by ``shift`` in m along the axis."""
+    """A second magnet, displaced by ``shift`` in m along the axis.
+
+    Its bodies and its iron are those of the first without the faults that are hidden in that.
+    """
 
     shift: float
+    bodies: tuple[Body, ...] = ()
+    iron: TrueIron | None = None
 
 
 @dataclass(frozen=True)
@@ -216,18 +244,15 @@ class SoftSphere:
     place: Vector
     volume: float
 
+    @property
+    def radius(self) -> float:
+        """Radius in m."""
+        return float((3 * self.volume / (4 * np.pi))**(1 / 3))
 
-@dataclass(frozen=True)
-class VacuumNeighbour:
-    """A second magnet with the same blocks in vacuum, to which nothing reacts.
 
-    It is turned by ``turn`` in rad about the axis and displaced by ``shift`` in m along it; its
-    remanences are multiplied by ``factor``.
-    """
-
-    shift: float
-    turn: float
-    factor: float
+def _answering_to_nothing(bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Return bodies with the permeability of vacuum."""
+    return tuple(replace(body, along=1.0, across=1.0) for body in bodies)
 
 
 @dataclass(frozen=True)
@@ -245,8 +270,9 @@ class TrueMagnet:
     """Neighbouring magnets."""
     objects: tuple[SoftSphere, ...] = ()
     """Ferromagnetic objects in the surroundings."""
-    neighbours: tuple[VacuumNeighbour, ...] = ()
-    """Neighbouring magnets in vacuum that the study knows of."""
+    neighbours: tuple[Body, ...] = ()
+    """Blocks, in their places, of neighbouring magnets that the study knows of. They are in vacuum,
+    and nothing reacts to them."""
     dipoles: tuple[tuple[Vector, Vector], ...] = ()
     """Places in m and moments in A m^2 of distant magnetized objects."""
     losses: tuple[LostCell, ...] = ()
@@ -256,18 +282,18 @@ class TrueMagnet:
     def all_bodies(self) -> tuple[Body, ...]:
         """The blocks of the magnet and of its copies."""
         return self.bodies + tuple(
-            replace(body, centre=vector(np.add(body.centre, (0, 0, copy.shift))))
-            for copy in self.copies for body in self.bodies)
+            body.lifted(copy.shift) for copy in self.copies for body in copy.bodies)
 
     @property
     def all_iron(self) -> TrueIron | None:
         """The iron of the magnet and of its copies."""
-        iron = self.iron
-        if iron is None or not self.copies:
-            return iron
-        return replace(iron, bodies=iron.bodies + tuple(
-            replace(body, origin=vector(np.add(body.origin, (0, 0, copy.shift))))
-            for copy in self.copies for body in iron.bodies))
+        found = self.iron
+        for copy in self.copies:
+            if copy.iron is not None:
+                there = tuple(replace(body, origin=vector(np.add(body.origin, (0, 0, copy.shift))))
+                              for body in copy.iron.bodies)
+                found = replace(copy.iron, bodies=(found.bodies if found else ()) + there)
+        return found
 
     @property
     def half_length(self) -> float:
@@ -279,7 +305,20 @@ class TrueMagnet:
     @property
     def is_vacuum(self) -> bool:
         """Whether no material responds to a field: no iron, and all permeabilities 1."""
-        return self.iron is None and all(body.is_vacuum for body in self.bodies)
+        return self.iron is None and all(body.is_vacuum for body in self.all_bodies)
+
+    @property
+    def answers(self) -> tuple[object, ...]:
+        """What of the magnet answers to a field, and how: iron, and permeabilities of blocks."""
+        return self.all_iron, [(body.along, body.across) for body in self.all_bodies]
+
+    @cached_property
+    def in_vacuum(self) -> TrueMagnet:
+        """The magnet without iron, with the remanences of its blocks in vacuum."""
+        return replace(
+            self, iron=None, bodies=_answering_to_nothing(self.bodies), copies=tuple(
+                replace(copy, iron=None, bodies=_answering_to_nothing(copy.bodies))
+                for copy in self.copies))
 
     def with_magnetizations(self, magnetizations: Floats) -> TrueMagnet:
         """Return the magnet with other magnetizations (bodies, dimension) in A/m."""
@@ -291,12 +330,13 @@ class TrueMagnet:
 
     def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside a block or the iron."""
-        inside = np.zeros(len(points), bool)
-        for body in self.all_bodies:
-            inside |= body.holds(points)
-        for solid in self.all_iron.bodies if self.all_iron else ():
-            inside |= solid.holds(points)
-        return inside
+        return np.any([solid.holds(points) for solid in self.solids], axis=0)
+
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        """All that no probe can be in: blocks, also of other magnets, and iron."""
+        return (*self.all_bodies, *self.neighbours,
+                *(self.all_iron.bodies if self.all_iron else ()))
 
 
 def vector(values: Floats | tuple[float, ...]) -> Vector:
@@ -567,3 +607,119 @@ def law_of(iron: IronMaterial | Iron) -> IronLaw:
         field, flux_density = curve.H_A_per_m, curve.B_T
     start = () if field[0] == 0 else (0.0,)
     return TableLaw((*start, *field), (*start, *flux_density))
+
+
+Solid = Body | Tube | Pole | Ball
+
+
+@lru_cache(maxsize=1024)
+def _section(shape: Shape | Tube | Pole) -> convex_pieces.Shape:
+    """Return the section of a body in its axes; that of a sector is about the axis of its tube."""
+    if isinstance(shape, Tube):
+        return convex_pieces.annulus(shape.inner, shape.outer)
+    if isinstance(shape, CylinderBody):
+        return convex_pieces.Shape(circle(shape.radius))
+    if isinstance(shape, Pole):
+        shape = PolygonBody(shape.outline, 0.0)
+    if not isinstance(shape, SectorBody):
+        return convex_pieces.Shape(closed_outline(shape.corners))
+    parts = 1 if 2 * shape.half_angle < HALF_TURN else 3
+    arc = unit_circle(np.linspace(-shape.half_angle, shape.half_angle, parts + 1))[:, :2]
+    return convex_pieces.Shape(closed_outline(
+        np.vstack([shape.outer * arc, shape.inner * arc[::-1]]),
+        tuple(number for number in range(2 * parts + 1) if number != parts)))
+
+
+def _prisms(solids: Sequence[Body | Tube | Pole], dimension: int) -> Bodies:
+    """Return solids as what the study's own check of overlaps compares."""
+    numbers: dict[convex_pieces.Shape, int] = {}
+    which, limits, axes, places = [], [], [], []
+    for solid in solids:
+        if isinstance(solid, Body):
+            half, middle = solid.shape.length / 2, 0.0
+            turn = solid.shape_orientation if dimension == 3 else Rotation.from_euler(
+                "z", solid.rotation[2] + solid.angle) * solid.seat_orientation
+            shift = solid.shape.middle if isinstance(solid.shape, SectorBody) else 0.0
+            place = solid.position - turn.apply([shift, 0.0, 0.0])
+        else:
+            half, middle = solid.half_length, solid.middle
+            turn, place = Rotation.from_rotvec(solid.turn), np.array(solid.origin)
+        section = _section(solid.shape if isinstance(solid, Body) else solid)
+        which.append(numbers.setdefault(section, len(numbers)))
+        limits.append((middle - half, middle + half))
+        axes.append(turn.as_matrix())
+        places.append(place)
+    return Bodies(list(numbers), np.array(which), np.array(limits), np.array(axes),
+                  np.array(places))
+
+
+def distance_from(solid: Solid, points: Floats, dimension: int) -> Floats:
+    """Return the distances (n,) in m of points (n, 3) from a block or iron; negative inside."""
+    if isinstance(solid, Ball):
+        return np.asarray(np.linalg.norm(points - solid.origin, axis=1) - solid.radius)
+    prism = _prisms([solid], dimension)
+    there, (low, high) = (points - prism.position[0]) @ prism.axes[0], prism.limits[0]
+    if isinstance(solid, Tube):
+        return distance_from_tube(solid.inner, solid.outer, low, high, there)
+    return distance_from_prism(prism.shapes[0].outline, low, high, there)
+
+
+def in_words(solid: Solid) -> str:
+    """Describe a block or a body of iron."""
+    if not isinstance(solid, Body):
+        return "iron"
+    return f"block {solid.name or f'r{solid.ring:02d}s{solid.slot:02d}'}"
+
+
+def check_room(magnet: TrueMagnet, before: TrueMagnet) -> None:
+    """Raise a StudyError if what hidden effects moved, or added, is where something is already.
+
+    Blocks are compared as the study compares those that its exceptions move: they may be squeezed
+    as a tolerance of the assembly squeezes them.
+
+    Parameters
+    ----------
+    before : TrueMagnet
+        The magnet without the effects, whose blocks leave each other room.
+    """
+    rooms = {body.room for body in before.bodies}
+    there = [body for body in (*magnet.all_bodies, *magnet.neighbours) if any(body.remanence)]
+    iron = magnet.all_iron.bodies if magnet.all_iron else ()
+    for sphere in magnet.objects:
+        for solid in (*there, *iron):
+            away = float(distance_from(solid, np.array([sphere.place]), magnet.dimension)[0])
+            if away < sphere.radius:
+                raise StudyError(must_be(
+                    "position of --hide ferromagnetic_object", "the study",
+                    f"more than {1e3 * sphere.radius:.3g} mm from blocks and iron, the radius of a "
+                    "sphere of this volume",
+                    f"{1e3 * abs(away):.3g} mm {'from' if away > 0 else 'within'} "
+                    f"{in_words(solid)}", "Move the object away, or make its volume smaller."))
+    moved = [body for body in there if body.room not in rooms]
+    others = [body for body in there if body.room in rooms]
+    added = iron if magnet.all_iron != before.all_iron else ()
+    for some, rest in ((moved, None), (moved, others), (moved, iron), (others, added),
+                       (added, None)):
+        if (found := _overlap(some, rest, magnet.dimension)) is not None:
+            raise StudyError(
+                "What --hide moves or adds must leave blocks and iron room; instead "
+                f"{in_words(found[0])} and {in_words(found[1])} overlap by at least "
+                f"{1e3 * found[2]:.3g} mm. Hide smaller values, or make room in the study.")
+
+
+def _overlap(
+    some: Sequence[Solid], rest: Sequence[Solid] | None, dimension: int
+) -> tuple[Solid, Solid, float] | None:
+    """Return two solids, one of ``rest`` if that is given, that overlap, and by how much in m."""
+    others = some if rest is None else rest
+    flat, beside = ([one for one in each if not isinstance(one, Ball)] for each in (some, others))
+    if flat and beside and (found := first_overlap(
+            _prisms(flat, dimension), None if rest is None else _prisms(beside, dimension),
+            SQUEEZED)):
+        return flat[found[0]], beside[found[1]], found[2]
+    for ball in (each for each in others if isinstance(each, Ball)):
+        for one in some:
+            depth = ball.radius - distance_from(one, np.array([ball.origin]), dimension)[0]
+            if one is not ball and depth > SQUEEZED * ball.radius:
+                return one, ball, float(depth)
+    return None

@@ -40,7 +40,7 @@ from sealed_cases_page import page
 from stated_probabilities import error_if_calibrated, expected_calibration_error, frequencies
 
 from halbach_fe.cli import common
-from halbach_fe.core.errors import CheckFailedError, HalbachError
+from halbach_fe.core.errors import CheckFailedError, HalbachError, StudyError
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
@@ -65,8 +65,15 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
-from halbach_fe.synthetic.hidden_effects.effect_types import site_of
-from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
+from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, site_of
+from halbach_fe.synthetic.simulate import (
+    SimulatedCampaign,
+    draw_magnet,
+    simulate_campaign,
+    streams,
+    true_field,
+    with_hidden,
+)
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0
@@ -147,8 +154,23 @@ def drawn_case(
                   if (values := drawn_fault(name, study, generator)) is not None]
         with_blocks = bool(generator.integers(2))
         if len(faults) == len(hidden) and (with_blocks or "rings_swapped" not in hidden) and (
-                study.name in magnets and can_have(study, outside)):
+                study.name in magnets and can_have(study, outside)) and (
+                can_hide(study, seed, faults)):
             return Case(seed, study, tuple(faults), outside, with_blocks)
+
+
+def can_hide(study: Study, seed: int, faults: Sequence[tuple[str, tuple[float, ...]]]) -> bool:
+    """Tell whether a map shows effects, and blocks leave each other room; not of slow ones."""
+    if {name for name, _ in faults} & {*SLOW}:
+        return True
+    nominal = magnet_of(study)
+    hidden = [ChosenEffect(CAN_BE_HIDDEN[name], values) for name, values in faults]
+    drawn = draw_magnet(study, nominal, streams(seed)[0])
+    try:
+        with_hidden(study, drawn.mounted, hidden, site_of(study, nominal), seed)
+    except StudyError:
+        return False
+    return True
 
 
 def cases(

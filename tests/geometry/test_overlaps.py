@@ -16,7 +16,7 @@ from halbach_fe.geometry.array_layout import sector_outline
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import closed_outline
-from halbach_fe.geometry.overlaps import block_in_iron, overlapping_blocks
+from halbach_fe.geometry.overlaps import SQUEEZED, block_in_iron, overlapping_blocks
 from tests.conftest import processor_time
 
 INNER, OUTER = 0.104, 0.1865
@@ -440,3 +440,23 @@ def test_crossing_edges_are_refused():
         np.cos(4 * np.pi / 5 * np.arange(5)), np.sin(4 * np.pi / 5 * np.arange(5))]))
     with pytest.raises(StudyError, match="edges do not cross"):
         overlapping_blocks([block(pentagram), block(pentagram)])
+
+
+def test_sectors_that_are_deeper_in_others_than_a_squeezed_assembly():
+    """18 mm of touching sectors of 80 mm, and 19 mm of a tube: the narrow pieces of their arcs
+    measured less than a tenth of their size, so that studies had both fields at once. The control
+    is a shift of 1 mm.
+    """
+    tube = IronSolid(0.1866, 0.2, *FINITE)
+    for limits in (LONG, FINITE):
+        first, *others = ring(count=8, limits=limits)
+        for shift, is_deep in ((0.02, True), (0.001, False)):
+            along, outwards = (replace(first, displacement_m=place) for place in (
+                (0.0, shift, 0.0), (shift, 0.0, 0.0)))
+            found = (overlapping_blocks([along, *others], SQUEEZED),
+                     block_in_iron([outwards], [replace(tube, z_min=limits[0], z_max=limits[1])],
+                                   SQUEEZED))
+            assert [each is not None for each in found] == [is_deep, is_deep]
+            if is_deep:  # normal to the side; less than the wall, beyond the gap of 0.1 mm
+                assert found[0][2] == pytest.approx(0.02 * np.cos(np.pi / 8), rel=1e-3)
+                assert found[1][2] == pytest.approx(0.0199, rel=0.1)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 
 import magpylib
@@ -20,6 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
+from halbach_fe.report.field import answer
 from halbach_fe.response.field_on_lines import Lines, field_on_lines
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -434,6 +437,21 @@ def test_points_that_are_too_far_apart_are_in_the_bars():
         assert np.abs(found_phi - right_phi) < 3 * bar
     through = Lines(np.array([0, 0.03, -0.05]), np.array([0, 0.03, 0.05]), count=8)
     assert solved(through, inside=True).relative_spacing > 0.01
+
+
+def test_integrals_that_are_not_known_are_no_yes():
+    """Of seven points one is at the magnet, and of three beside it none: "Yes" stood beside 98 %,
+    and beside an error of 1e5 % of the integral of |B|. The control has enough points.
+    """
+    magnet = magnet_of()
+    for count, end, part in ((7, 0.3, r"[6-9]\d % of"), (3, 0.4, "more than"), (201, 0.3, "")):
+        lines = Lines(np.array([0.001, 0.001, -0.3]), np.array([0.001, 0.001, end]), count=count)
+        with pytest.warns(HalbachWarning, match=part) if part else nullcontext():
+            found = hf.field(magnet, lines)
+        said = answer(found)
+        assert said.trust.startswith("Only the field at the points" if part else "Yes")
+        assert re.search(f"{part} the integral" if part else "", said.trust)
+        assert said.sound == (not part)
 
 
 def test_a_study_with_uncertain_amplitudes_has_a_prior():

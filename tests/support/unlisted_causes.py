@@ -97,11 +97,11 @@ def simulate_unlisted(
     radius = np.hypot(points[:, 0], points[:, 1]).round(9)
     keys = [(radius, angle, points[:, 2]), (points[:, 2], angle, radius)][generator.integers(2)]
     points = points[np.lexsort(keys)]
-    check_air(magnet, points)
+    check_air(magnet, points, len(points))
     sigma = point_noise(study, points)
 
     def field_at(places: Floats) -> Floats:
-        check_air(magnet, places)
+        check_air(magnet, places, len(places))
         return true_field(magnet, places)
 
     chosen = families()[generator.integers(len(families()))] if family is None else family

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.positions import points_from
@@ -29,6 +31,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, site_
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import measured, simulate_campaign, true_field
+from halbach_fe.synthetic.true_magnet import check_room
 from tests.conftest import DIPOLE, ROOT, changed
 
 RINGS = changed(
@@ -686,6 +689,166 @@ def test_gross_maps_are_written(tmp_path):
     np.testing.assert_allclose(columns[1], 1000 * columns[0], rtol=1e-9, atol=1e-6)
     assert read_map(tmp_path / "plain" / "map.csv")["time_s"].values[-1] == 23
     assert len(read_blocks(tmp_path / "millitesla" / "blocks.csv")) == 16
+
+
+# --- what was silent -----------------------------------------------------------------------------
+
+
+def campaign(document, *texts):
+    return simulate_campaign(parse_study(document), 1, hide=list(map(parse_hidden_effect, texts)))
+
+
+@pytest.mark.parametrize(("place", "volume", "sentence"), [
+    # 10 mm from a reading, and 0.03 mm from one held out; radii of 14 and 6.2 mm
+    ("0.06,0,-0.07", 1.15e-5, r"14 mm.* 10 mm from reading 1 of the map at \(0.07, 0, -0.07\) m"),
+    ("0.0647,0.0268,-0.035", 1e-6, r"from held-out reading 1 at \(0.0646716, 0.0267878, -0.035"),
+    # blocks begin at 104 mm: 4 mm away, and in one
+    ("0.1,0,0.07", 1.15e-5, "14 mm from blocks and iron.* 4 mm from block r02s07"),
+    ("0.124,0,0.04", 1e-9, "20 mm within block r02s07")])
+def test_an_object_in_the_place_of_a_reading_or_a_block(place, volume, sentence):
+    """Its dipole had up to 1e6 T there, without a word; distances and radii by hand."""
+    with pytest.warns(HalbachWarning, match="volume") if volume > 1e-7 and (
+            "reading" in sentence) else nullcontext(), pytest.raises(
+            StudyError, match=sentence) as refused:
+        campaign(CUBOIDS, f"ferromagnetic_object={place},{volume}")
+    assert "make its volume smaller" in str(refused.value)
+
+
+def test_an_object_apart_from_readings():
+    """The control: a sphere of 2.3 mm radius, 20 mm from a reading."""
+    hidden = campaign(CUBOIDS, "ferromagnetic_object=0.05,0,-0.07,5e-8")
+    assert hidden.truth["effects"]
+
+
+def test_an_object_within_a_single_block():
+    """The corners of a cube on the axis are 14 mm from it, which counted as room around it."""
+    cube = changed(RINGS, array__rings=0, array__free_blocks={
+        "name": ["c"], "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0],
+        "size_x_m": [0.02], "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.0]})
+    with pytest.raises(StudyError, match="10 mm within block c"):
+        campaign(cube, "ferromagnetic_object=0,0,0,1e-9")
+
+
+@pytest.mark.parametrize(("document", "texts", "by", "allowed"), [
+    (RINGS, ["block_displaced=1,1,0,0.02,0"], 20, ["block_displaced=1,1,0,0.001,0"]),
+    (SECTION, ["block_displaced=1,1,0,0.02,0"], 20, ["block_displaced=1,1,0,0.001,0"]),
+    (RINGS, ["block_turned=1,1,0,0,0.5"], 40, ["block_turned=1,1,0,0,0.02"]),
+    (RINGS, ["ring_gap=1,-0.02"], 20, ["ring_gap=1,-0.001"]),
+    (RINGS, ["ring_shifted_along=1,0.03"], 30, ["ring_shifted_along=1,-0.03"]),
+    (RINGS, ["ring_tilted=1,0.3,0"], 60, ["ring_tilted=1,0.003,0"]),
+    (RINGS, ["radial_gap=-0.03"], 30, ["radial_gap=0.03"]),
+    (RINGS, ["azimuthal_gap=-0.03"], 40, ["azimuthal_gap=0.01"]),
+    (RINGS, ["halves_apart=1,-0.02,0,0"], 20, ["halves_apart=1,0.02,0,0"]),
+    (RINGS, ["wrong_ring_count=1", "neighbour_magnet=0.002"], 80,
+     ["wrong_ring_count=1", "neighbour_magnet=0.1"]),
+    (RINGS, ["iron_ring=0.187,0.2,500,2", "radial_gap=0.02"], 20,
+     ["iron_ring=0.21,0.22,500,2", "radial_gap=0.02"]),
+    (changed(RINGS, iron={"relative_permeability": 50.0, "bodies": [
+        {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.22, -0.04]}]}),
+     ["radial_gap=0.02"], 6.5, ["radial_gap=0.01"])])
+def test_blocks_that_are_moved_into_others_or_into_iron(document, texts, by, allowed):
+    """The fields of both were added. What is said is a lower bound of the overlap (mm, by hand),
+    and more than an assembly squeezes: a tenth of a block's half width.
+    """
+    study = parse_study(document)
+    magnet = magnet_of(study)
+    site = site_of(study, magnet)
+
+    def hide(names):
+        check_room(with_effects(magnet, site, [
+            ChosenEffect(*parse_hidden_effect(text)) for text in names]), magnet)
+
+    with pytest.raises(StudyError, match="overlap by at least") as refused:
+        hide(texts)
+    said = float(re.search(r"at least ([\d.]+) mm", str(refused.value))[1])
+    assert 4 < said < 1.01 * by
+    hide(allowed)
+
+
+@pytest.mark.parametrize("name", [name for name, effect in EFFECTS.items()
+                                  if effect.magnet and name != "knee"])
+def test_effects_that_are_drawn_leave_room(name):
+    study = parse_study(RINGS)
+    magnet = magnet_of(study)
+    site = site_of(study, magnet)
+    for seed in range(4):
+        values = EFFECTS[name].draw(site, np.random.default_rng(seed))
+        check_room(with_effects(magnet, site, [ChosenEffect(EFFECTS[name], values)]), magnet)
+
+
+PLANE = changed(CUBOIDS, observation__components=["x"], observation__positions={
+    "kind": "points", "points_m": [[0, 0, 0], [0.03, 0.03, 0], [0.01, -0.04, 0]]})
+
+
+@pytest.mark.parametrize(("document", "texts"), [
+    (CUBOIDS, ["rotated_by_one_block=8"]), (CUBOIDS, ["wrong_ring_count=0"]),
+    (CUBOIDS, ["gain_x=0"]), (CUBOIDS, ["block_displaced=1,1,0,0,0"]),
+    (CUBOIDS, ["background=0,0,1e-13"]), (CUBOIDS, ["outliers=1e-6,0.01"]),
+    (CUBOIDS, ["block_missing=1,1", "block_displaced=1,1,0.001,0,0"]),
+    (CUBOIDS, ["block_put_in_wrongly=1,1,0,0,0"]),
+    (CUBOIDS, ["ferromagnetic_object=0,0,0.9,1e-12"]),
+    (PLANE, ["arm_sag=0.001"]), (PLANE, ["lag=0.0005"]), (PLANE, ["reversed_z"]),
+    (PLANE, ["z_scale=0.001"]), (PLANE, ["sign_flipped_axis=2"]), (PLANE, ["swapped_axes=2,3"]),
+    (PLANE, ["background=0,1e-4,0"]), (PLANE, ["slow_readings=0,0"]),
+    (SECTION, ["block_displaced=1,1,0,0,0.001"]), (SECTION, ["sign_flipped_axis=3"]),
+    (SECTION, ["mapper_translation=0,0,0.001"])])
+def test_effects_that_hide_nothing(document, texts):
+    """The truth told of them, and no reading was another."""
+    with pytest.raises(StudyError, match=f"--hide {texts[-1].partition('=')[0]} of the study must "
+                                         "be an effect that readings of the map show"):
+        campaign(document, *texts)
+
+
+@pytest.mark.parametrize("text", ["sign_flipped_axis=1", "rotated_by_one_block=1", "reversed_z"])
+def test_effects_that_hide_something(text):
+    """The control."""
+    document = CUBOIDS if text == "reversed_z" else PLANE
+    plain = campaign(document)
+    assert np.nanmax(np.abs(campaign(document, text).readings["B_T"].values
+                            - plain.readings["B_T"].values)) > 0.01
+
+
+@pytest.mark.parametrize(("text", "sentence"), [
+    ("gain_x=1.02", "1.02, where such effects have up to some 0.01. If a factor is meant, give "
+     "what it is above 1: 0.02"), ("mapper_translation=0.03,0,0", "x .* 0.03 m, .* 0.002 m"),
+    ("halves_apart=1,0.001,0.03,0", "sideways .* 0.03 m, .* 0.0009 m")])
+def test_values_far_beyond_the_usual_ones(text, sentence):
+    """They are hidden, and said. The control is any other value: warnings fail the tests."""
+    with pytest.warns(HalbachWarning, match=sentence):
+        campaign(CUBOIDS, text)
+
+
+def test_neighbours_have_no_hidden_faults():
+    """A block that is missing here is not missing there: blocks of neighbours are others.
+
+    What a fault changes is the same with a neighbour beside the magnet as without, whether the
+    study knows of it or it is hidden too; and neighbours deviate as the prior has it.
+    """
+    here, known = (changed(CUBOIDS, prior={"magnitude_sd": 0.02}, **more) for more in ({}, {
+        "external": {"neighbours": [{"z_m": 0.3}]}}))
+
+    def change(document, *beside):
+        with_fault, without = (campaign(document, *beside, *fault).without_noise
+                               for fault in (["block_missing=2,1"], []))
+        return with_fault - without
+
+    alone = change(here)
+    assert np.abs(alone).max() > 0.01
+    np.testing.assert_allclose(change(known), alone, atol=2e-12)
+    np.testing.assert_allclose(change(here, "neighbour_magnet=0.14"), alone, atol=2e-12)
+    truth = campaign(known).truth
+    own, other = (np.array([block["magnetization_A_per_m"] for block in truth[name]])
+                  for name in ("blocks", "blocks_of_neighbours"))
+    off = (np.linalg.norm(own, axis=1) / np.linalg.norm(other, axis=1)) - 1
+    assert 0.01 < off.std() < 0.06  # sqrt(2) 0.02 of 16 blocks: 4 sigma
+
+
+def test_points_within_blocks_are_told_how_deep_they_are():
+    """They were to be moved off by a micrometre."""
+    with pytest.raises(StudyError, match=r"reading 1 of the map at \(0.113, 0, -0.07\) m, 9 mm "
+                       "inside block r01s07. Move it off by 9 mm or more"):
+        campaign(changed(CUBOIDS, observation__positions={
+            **CUBOIDS["observation"]["positions"], "radius_m": 0.113}))
 
 
 @pytest.mark.parametrize("texts", [

@@ -5,12 +5,14 @@ They share no code with the effects of `halbach_fe.diagnosis`, which are to find
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 
 import numpy as np
 
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.study.types import wrong_unit
 from halbach_fe.synthetic.hidden_effects import instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
@@ -136,6 +138,29 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
         refuse(*refused)
 
 
+def doubt_size(site: Site, hidden: ChosenEffect) -> None:
+    """Warn of values that are far beyond those that effects of this name usually have."""
+    if hidden.effect.group == "gross":
+        return
+    generator, draws, far = np.random.default_rng(0), 64, 10.0
+    drawn = np.abs([hidden.effect.draw(site, generator) for _ in range(draws)])
+    places = {*AXES, "ring", "slot", "other_ring", "other_slot", "seam",
+              *("xyz" if "volume" in hidden.by_name else ())}
+    sizes = [(parameter, value, most) for parameter, value, most in zip(
+        hidden.effect.parameters, hidden.values, drawn.max(axis=0), strict=True)
+        if parameter.name not in places]
+    for parameter, value, _ in sizes:
+        most = max(other for one, _, other in sizes if one.unit == parameter.unit)
+        if most and abs(value) > far * most:
+            unit = f" {parameter.unit}" if parameter.unit else ""
+            warnings.warn(
+                f"{parameter.name} of --hide {hidden.effect.name} is {value:g}{unit}, where such "
+                f"effects have up to some {most:.1g}{unit}."
+                + (f" If a factor is meant, give what it is above 1: {value - 1:.3g}."
+                   if parameter.name == "fraction" and 0.5 < value < 2 else ""), HalbachWarning,
+                stacklevel=3)
+
+
 def _check_place(site: Site, hidden: ChosenEffect) -> None:
     """Raise a StudyError if an effect is at a ring, slot, seam or axis that does not exist."""
     limits = {"ring": site.rings, "slot": site.slots, "other_ring": site.rings,
@@ -163,12 +188,14 @@ def with_effects(
     """Return the magnet with hidden effects.
 
     With ``single`` only those are applied that the blocks have before they are mounted, which the
-    Helmholtz coil therefore measures.
+    Helmholtz coil therefore measures. A copy of the magnet beside it has none of them.
     """
+    faulty = magnet
     for chosen in hidden:
         if chosen.effect.magnet is not None and (chosen.effect.of_blocks or not single):
-            magnet = chosen.effect.magnet(magnet, site, *chosen.values)
-    return magnet
+            faulty = chosen.effect.magnet(faulty, site, *chosen.values)
+    return replace(faulty, copies=tuple(
+        replace(copy, bodies=magnet.bodies, iron=magnet.iron) for copy in faulty.copies))
 
 
 def instrument_with(site: Site, hidden: Sequence[ChosenEffect]) -> FaultyInstrument:

@@ -40,7 +40,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     signed_log_uniform,
 )
 from halbach_fe.synthetic.shapes import Vector
-from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Ball, Body, TrueMagnet, vector
+from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Ball, TrueMagnet, vector
 
 IDEAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -110,7 +110,7 @@ class FaultyInstrument:
         outward = (self.radius_scale * radius + self.radius_error
                    + swing * np.cos(angle - phase))
         depth, start, end = self.sag
-        along = (z - start) / (end - start) if depth else np.zeros(len(z))
+        along = (z - start) / (end - start) if depth and end > start else np.zeros(len(z))
         height = -z if self.reversed_z else z
         probe = np.column_stack([
             x + outward * np.cos(angle),
@@ -373,15 +373,8 @@ def _sign_flipped(instrument: FaultyInstrument, site: Site, axis: float) -> Faul
 def rotated_by_one_block(magnet: TrueMagnet, site: Site, blocks: float) -> TrueMagnet:
     """Turn the magnet about its axis by the angle of one block, or of several."""
     angle = blocks * 2 * np.pi / site.slots
-    turn = Rotation.from_euler("z", angle)
-
-    def turned(body: Body) -> Body:
-        """Turn a body's nominal place as well, so that the mesh of the reaction turns too."""
-        return replace(body, angle=body.angle + angle, centre=vector(turn.apply(body.centre)),
-                       displacement=vector(turn.apply(body.displacement)),
-                       rotation=vector(turn.apply(body.rotation)))
-
-    return replace(magnet, bodies=tuple(turned(body) for body in magnet.bodies))
+    # their nominal places as well, so that the mesh of the reaction turns too
+    return replace(magnet, bodies=tuple(body.turned(angle) for body in magnet.bodies))
 
 
 def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:

@@ -381,7 +381,7 @@ def background(magnet: TrueMagnet, site: Site, x: float, y: float, z: float) -> 
 def neighbour_magnet(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
     """Add a copy of the magnet on its axis, with ``distance`` between the facing ends.
 
-    A negative distance puts the copy at lower z.
+    A negative distance puts the copy at lower z. `with_effects` gives it its bodies.
     """
     shift = np.sign(distance) * (2 * site.half_length + abs(distance))
     return replace(magnet, copies=(*magnet.copies, MagnetCopy(float(shift))))
@@ -484,16 +484,6 @@ def _beside(_: Site, values: Values) -> Refused:
         "distance", f"at least {nearest_m:g} m on either side", values["distance"])
 
 
-def _outside_of_blocks(site: Site, values: Values) -> Refused:
-    """Refuse a sphere that reaches into blocks."""
-    radius = (3 * values["volume"] / (4 * np.pi))**(1 / 3)
-    from_axis = float(np.hypot(values["x"], values["y"]))
-    away = max(from_axis - site.outer, site.inner - from_axis, abs(values["z"]) - site.half_length)
-    return None if away >= radius else (
-        "position", f"more than {radius:.3g} m away from the blocks, the radius of a sphere of "
-        "this volume", away)
-
-
 def _of_two_blocks(_: Site, values: Values) -> Refused:
     """Refuse a block that changes places with itself."""
     return None if (values["ring"], values["slot"]) != (
@@ -580,7 +570,7 @@ EFFECTS = (
     _effect("neighbour_magnet", "distance m", _draw_neighbour, neighbour_magnet, "3d",
             check=_beside, distance=(-10.0, 10.0)),
     _effect("ferromagnetic_object", "x m, y m, z m, volume m^3", _draw_object,
-            ferromagnetic_object, "3d", check=_outside_of_blocks, x=METRES, y=METRES, z=METRES,
+            ferromagnetic_object, "3d", x=METRES, y=METRES, z=METRES,
             volume=(1e-12,)),
     _effect("knee", "coercivity A/m, squareness", lambda site, generator: (
         generator.uniform(5.0e5, 5.8e5), generator.uniform(0.8, 0.9)), knee, "3d", "vacuum",
