@@ -330,8 +330,9 @@ class PositionNoise:
     """The evidence and the size of random errors of the positions."""
 
     log_bayes_factor: float
-    """Log Bayes factor, averaged over the candidate sizes, over the better of two alternatives: no
-    such errors, or noise that is larger everywhere by the best factor."""
+    """Log Bayes factor, averaged over the candidate sizes, over the best of three alternatives: no
+    such errors, or noise that is larger everywhere, or of the component with the largest residuals,
+    by the best factor."""
     sd_m: float
     """The likeliest standard deviation of a position along each axis."""
     map: str | None = None
@@ -426,8 +427,9 @@ def _of_map(
         readings = scale * (analysis @ terms.fields.reshape(len(terms.fields), -1).T)
         smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAY_RATES[0])))
     nuisance = np.hstack([marginal.whitened, effect_scale * columns, *smooth])
+    component = np.asarray(abs(analysis).argmax(axis=1)).ravel() % 3
     found = compare_noise_models(nuisance[rows], residual[rows], sparse.csr_array(moved[rows]),
-                                 current.sd_m if current else 0.0)
+                                 component[rows], current.sd_m if current else 0.0)
     log_odds = found.log_bayes_factor + np.log(EFFECT_PRIOR_ODDS)
     return found if log_odds > DETECTION_LOG_ODDS else None
 
@@ -461,7 +463,8 @@ def _added(noise: NoiseSettings | None, sd_m: float) -> NoiseSettings:
 
 
 def compare_noise_models(
-    root: Floats, residual: Floats, per_displacement: sparse.csr_array, current_sd_m: float,
+    root: Floats, residual: Floats, per_displacement: sparse.csr_array, component: Ints,
+    current_sd_m: float,
 ) -> PositionNoise:
     """Compare the evidence of whitened readings with and without position noise.
 
@@ -473,17 +476,20 @@ def compare_noise_models(
         Whitened readings less their prior prediction.
     per_displacement : sparse array, shape (n, k)
         Whitened change of the readings per m as each point moves along each axis.
+    component : ndarray of int, shape (n,)
+        The component of B that each reading is of.
     current_sd_m : float
         Standard deviation of the position noise that the whitening already includes.
     """
-    # Largest factor of the noise in the alternative of noise that is larger everywhere.
+    # Largest factor of the noise in the alternatives of noise that is larger.
     max_noise_factor = 30.0
     moved = sparse.csr_array(per_displacement @ per_displacement.T)
-    root = _compressed(root)
+    root, everywhere = _compressed(root), np.ones(len(residual), bool)
 
-    def log_evidence(sd: float, factor: float = 1.0) -> float:
-        total = NoiseCovariance(sparse.csr_array(factor**2 * (
-            sparse.eye_array(len(residual)) + (sd**2 - current_sd_m**2) * moved)))
+    def log_evidence(sd: float, factor: float = 1.0, of: Bools = everywhere) -> float:
+        scale = sparse.diags_array(np.where(of, factor, 1.0))
+        total = NoiseCovariance(sparse.csr_array(scale @ (
+            sparse.eye_array(len(residual)) + (sd**2 - current_sd_m**2) * moved) @ scale))
         marginal = Marginal.of(total.whiten(root))
         white = total.whiten(residual)
         chi2 = float(white @ marginal.remove(white[:, None])[:, 0])
@@ -501,8 +507,11 @@ def compare_noise_models(
     mean = float(special.logsumexp(log_evidences) - np.log(len(log_evidences)))
     over_none = factor = mean - log_evidence(0.0)
     if factor > DETECTION_LOG_ODDS:
-        larger = best(partial(log_evidence, 0.0), 1.0, max_noise_factor)
-        factor = min(factor, mean - log_evidence(0.0, larger))
+        left = Marginal.of(root).remove(residual[:, None])[:, 0]**2
+        worst = max(set(component.tolist()), key=lambda one: float(left[component == one].mean()))
+        for some in (everywhere, component == worst):
+            larger = best(partial(log_evidence, 0.0, of=some), 1.0, max_noise_factor)
+            factor = min(factor, mean - log_evidence(0.0, larger, some))
     if factor < DETECTION_LOG_ODDS:
         return PositionNoise(factor, 0.0)
     top = int(np.argmax(log_evidences))

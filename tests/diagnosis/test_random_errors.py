@@ -164,15 +164,18 @@ def test_outliers_are_told_and_left_out(root, clean):
 SHAKEN_M = 1e-4
 
 
-@pytest.mark.parametrize("added", ["vibration", "nothing", "noise", "smooth", "translation"])
+@pytest.mark.parametrize("added", [
+    "vibration", "nothing", "noise", "one sensor", "smooth", "translation"])
 def test_vibration(added, root, gradient, clean, generator):
-    """Where it is there, and the negative controls: more noise, smooth errors that are no effect of
-    the catalogue, and what is one.
+    """Where it is there, and the negative controls: more noise, of one sensor too, smooth errors
+    that are no effect of the catalogue, and what is one.
     """
     shift = SHAKEN_M * generator.standard_normal((len(POINTS), 3))
     residual = clean + {
         "vibration": np.einsum("ncj,nj->nc", gradient, shift).ravel(),
         "noise": 2 * NOISE_T * generator.standard_normal(COUNT),
+        "one sensor": 3 * NOISE_T * (generator.standard_normal((len(POINTS), 3))
+                                      * [0.0, 0.0, 1.0]).ravel(),
         "smooth": 20 * NOISE_T * np.sin(25 * POINTS @ [[0.3, 0, 0], [0.5, 0, 0], [1, 1, 0]]
                                         ).ravel(),
         "translation": unmodelled("translation", root, gradient)}.get(added, 0.0)
