@@ -799,6 +799,16 @@ def tolerance(
     measured = None if blocks is None else prior_from_blocks(magnet, blocks)
     model, generator = objective_of(magnet, reference, session), np.random.default_rng(seed)
     prior = study_prior(magnet, len(model.nominal), measured.gaussian if measured else None)
+    angles = magnet.study.prior.mounting_sd_deg, (
+        0.0 if measured else magnet.study.prior.direction_sd_deg)
+    # what a block that turns by these angles about two axes loses along its own, in the mean
+    lost, most = 1 - float(np.exp(-np.sum(np.radians(angles)**2))), 0.01
+    if lost > most:
+        warnings.warn(
+            f"Angles of {' and '.join(f'{one:g}' for one in angles if one)} degrees are not small: "
+            f"blocks lose {100 * lost:.2g} % along their easy axes, of which tolerance, linear in "
+            "the angles, knows nothing. Its distribution is too narrow on that side.",
+            HalbachWarning, stacklevel=2)
     found = (predict_tolerance(model, magnet, prior, draws, generator, limit_units)
              if isinstance(model, MultipoleModel) else
              predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm))

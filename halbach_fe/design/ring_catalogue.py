@@ -18,6 +18,7 @@ from halbach_fe.response.region import Region
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.array import Array, Ring
 from halbach_fe.study.design import Design, DesignLayer
+from halbach_fe.study.external import External
 from halbach_fe.study.model import Study
 
 DECIMALS = 9
@@ -182,9 +183,9 @@ def obstacle(study: Study) -> tuple[str, str, str, str] | None:
     if study.dimension == 2:
         return "`dimension`", "3, for a design of rings", "2", ""
     external = study.external
-    if study.iron_ring or study.iron or external.neighbours or external.coils or external.dipoles:
-        return ("`design`", "of a magnet without iron, neighbours, coils and dipoles",
-                "one with some of them",
+    if study.iron_ring or study.iron or external != External():
+        return ("`design`", "of a magnet without iron and fields from outside",
+                "one with iron, background_T, neighbours, coils or dipoles",
                 "Leave them out of the search, and look at the result with them.")
     if array.free_blocks is not None or array.exceptions:
         return ("`array`", "of rings without exceptions, for a design",

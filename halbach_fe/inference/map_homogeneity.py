@@ -50,6 +50,7 @@ from halbach_fe.measurement.harmonic_field import (
     solid_harmonic_fields,
 )
 from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel
+from halbach_fe.response.region import Region
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
@@ -106,6 +107,15 @@ def map_homogeneity(
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))
+    points = readings.observation.points
+    near = points[_is_near(points, model.region, free)]
+    # a fit tells what is within a mean distance of readings around them
+    if len(near) and (ends := _ends_before(near, model, len(near)**(-1 / 3))):
+        return {}, np.nan, (
+            f"Of the map, a fit can use the readings within {1e3 * WITHIN * free:.3g} mm of the "
+            f"region's centre, as far as blocks and iron leave room, and there {ends}, less far "
+            "than the region: it does not tell how homogeneous the field is. Choose a smaller "
+            "region.",)
     parts = {MAP: np.ones_like(held_out)} | (
         {HELD_OUT_PART: held_out} if held_out.any() else {})
     found, noises, remarks = {}, {}, []
@@ -161,19 +171,31 @@ def of_other_size(of_map: Homogeneity, of_magnet: Homogeneity) -> str:
 
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:
     """Refuse a region that reaches beyond the readings, where a fit of them tells nothing."""
-    points, region = readings.observation.points, model.points[:len(model.weights)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    # how far a region may reach beyond the box around the readings, relative to its sides
-    beyond = 0.02
-    margin = beyond * (high - low)
-    outside = (region < low - margin) | (region > high + margin)
-    if outside.any():
-        axis = int(np.argmax(outside.sum(axis=0)))
+    beyond = 0.02  # relative to the sides of the box around the readings
+    if ends := _ends_before(readings.observation.points, model, beyond):
         raise MeasurementError(must_be(
             "the region", "the map", "within its points, to compare with its own homogeneity",
-            f"{model.region.text}, while {'xyz'[axis]} of the readings goes from "
-            f"{1e3 * low[axis]:.4g} to {1e3 * high[axis]:.4g} mm",
-            "Choose a smaller region, or leave the map out."))
+            f"{model.region.text}, while {ends}", "Choose a smaller region, or leave the map out."))
+
+
+def _ends_before(points: Floats, model: HomogeneityModel, beyond: float) -> str:
+    """Say where readings at points (n, 3) in m end before the region does, or nothing.
+
+    ``beyond`` is how far it may reach beyond the box around them, relative to its sides.
+    """
+    region, low, high = model.points[:len(model.weights)], points.min(axis=0), points.max(axis=0)
+    margin = beyond * (high - low)
+    outside = ((region < low - margin) | (region > high + margin)).sum(axis=0)
+    axis = int(np.argmax(outside))
+    return "" if not outside[axis] else (
+        f"{'xyz'[axis]} of the readings goes from {1e3 * low[axis]:.4g} to "
+        f"{1e3 * high[axis]:.4g} mm")
+
+
+def _is_near(points: Floats, region: Region, free_m: float) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) in m are near enough to a region's centre for the fit."""
+    away = np.linalg.norm(points - np.array(region.centre_m), axis=1)
+    return np.asarray(away <= WITHIN * free_m)
 
 
 def _fitted(
@@ -187,13 +209,14 @@ def _fitted(
     """
     observation, region = readings.observation, model.region
     centre = np.array(region.centre_m)
-    near = np.linalg.norm(observation.points - centre, axis=1) <= WITHIN * free_m
+    near = _is_near(observation.points, region, free_m)
+    near_m = 1e3 * WITHIN * free_m
     operator = observation.operator.tocsr()
     # a reading counts if all its sensors are near
     far = np.asarray(abs(operator) @ np.repeat(~near, 3).astype(float)).ravel() > 0
     used = np.flatnonzero(chosen & ~far)
     if not len(used):
-        return None, np.nan, (f"has no readings within {1e3 * WITHIN * free_m:.3g} mm of the "
+        return None, np.nan, (f"has no readings within {near_m:.3g} mm of the "
                               "region's centre, where blocks and iron leave room for a fit: it "
                               "does not tell how homogeneous the field is.")
     operator, sd = operator[used], readings.noise.sd[used]
@@ -209,9 +232,9 @@ def _fitted(
     through = 0.95
     if fit.used > through * len(scaled):
         return None, np.nan, (
-            f"has {len(scaled)} readings within {1e3 * WITHIN * free_m:.3g} mm of the region's "
-            "centre. A fit goes through all of them, so that it shows neither its noise nor its "
-            "error: it does not tell how homogeneous the field is. Measure more points there.")
+            f"has {len(scaled)} readings within {near_m:.3g} mm of the region's centre. A fit goes "
+            "through all of them, so that it shows neither its noise nor its error: it does not "
+            "tell how homogeneous the field is. Measure more points there.")
     terms = open_columns(study, lambda at: (
         _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3), maps, readings)[
             used] / sd[:, None]
@@ -242,10 +265,12 @@ def _fitted(
                              "not tell how homogeneous |B| is.")
     known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True,
                             told=part if lacking else None)
-    left = PPM * _open(fields[..., 1:], known.direction, model.weights) / known.mean_T
-    if left > OPEN * known.rms_ppm:
-        return None, noise, (f"leaves {left:.0f} ppm rms of the field in the region open, of "
-                             f"{known.rms_ppm:.0f} ppm: it does not tell how homogeneous it is.")
+    # numbers of such a fit are those of the prior of its amplitudes, and may be far from the truth
+    if PPM * _open(fields[..., 1:], known.direction, model.weights) > (
+            OPEN * known.rms_ppm * known.mean_T):
+        return None, noise, (
+            f"has {len(scaled)} readings within {near_m:.3g} mm of the region's centre, too few or "
+            "too noisy ones for the field in the region: it does not tell how homogeneous it is.")
     if remark:
         return replace(known, components="|B|"), noise, remark
     if not lacking:

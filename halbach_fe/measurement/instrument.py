@@ -30,6 +30,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.field_map import (
+    MAX_FIELD_T,
     POSITION_COLUMNS,
     TOTAL_COLUMN,
     TOTAL_COLUMNS,
@@ -67,7 +68,14 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
         has said which component the map holds.
     """
     refuse_undirected(data)
-    read = by_stated_units(instrument, data)
+    read, unit = by_stated_units(instrument, data), instrument.flux_density_unit_T
+    largest = max(float(np.abs(np.nan_to_num(read[name].values)).max())
+                  for name in ("B_T", TOTAL_COLUMN) if name in read)
+    if unit > 1 and largest > MAX_FIELD_T:  # check_magnitudes would advise another such unit
+        raise MeasurementError(must_be(
+            "`instrument.flux_density_unit_T`", "the study", "the T in a unit of the map, 0.001 "
+            "for mT", f"{unit:g}, with which the map has {largest:.3g} T",
+            f"Write {1 / unit:g}, or leave it out if the map is in T."))
     check_magnitudes(read)
     return read
 

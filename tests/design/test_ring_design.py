@@ -263,9 +263,10 @@ def test_impossible_designs_are_refused(changes, region, message, session):
                     "relative_permeability": 1000.0}}, "without iron"),
     # the search leaves out what a coil makes: 7650 ppm rms were said of a design of 7818
     ({"external": {"coils": [{"kind": "round", "radius_m": 0.03, "current_A": 200.0,
-                              "centre_m": [0.0, 0.0, 0.3]}]}}, "coils and dipoles"),
+                              "centre_m": [0.0, 0.0, 0.3]}]}}, "coils or dipoles"),
     ({"external": {"dipoles": [{"position_m": [0.0, 0.5, 0.0],
-                                "moment_A_m2": [0.0, 0.0, 10.0]}]}}, "coils and dipoles"),
+                                "moment_A_m2": [0.0, 0.0, 10.0]}]}}, "coils or dipoles"),
+    ({"external": {"background_T": [0.0, 0.02, 0.0]}}, "background_T"),  # not in its mean field
     ({"array": DOCUMENT["array"] | {"multipole_order": 2}}, "multipole_order"),
     ({"array": DOCUMENT["array"] | {"exceptions": [{"ring": 1, "remanence_T": 1.2}]}},
      "without exceptions")])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import scipy.stats as stats
 
 import halbach_fe as hf
+from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.design.tolerance import predict_tolerance
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
@@ -196,3 +199,17 @@ def test_measured_blocks_beside_other_parameters(ring, region):
         assert np.std(main(outside)) == pytest.approx(np.hypot(np.std(main(exact)), 0.01), rel=0.1)
     assert np.std(main(exact.with_(prior=exact.study.prior.with_(
         variation_sd=0.01, variation_length_m=0.02)))) > np.std(main(exact))
+
+
+@pytest.mark.parametrize(("angle", "part"), [(45.0, "46 %"), (8.0, "1.9 %"), (2.0, "")])
+def test_angles_that_are_not_small_are_said(angle, part):
+    """By Monte Carlo: the mean cosine of turns about two axes, which the model takes for 1."""
+    ring = hf.halbach_ring(order=1, blocks=8, inner_radius_m=0.02, outer_radius_m=0.04,
+                           length_m=0.05, remanence_T=1.2)
+    turned = ring.with_(prior=ring.study.prior.with_(direction_sd_deg=angle))
+    turns = np.radians(angle) * np.random.default_rng(1).standard_normal((200_000, 2))
+    with pytest.warns(HalbachWarning, match=f"lose {part}") if part else nullcontext():
+        hf.tolerance(turned, draws=100)
+    if part:
+        lost = 1 - np.cos(turns).prod(axis=1).mean()
+        assert 0.01 * float(part.split()[0]) == pytest.approx(lost, rel=0.03)

@@ -60,3 +60,14 @@ def test_a_map_in_another_unit_is_refused(tmp_path, row, said, unit):
         in_si_and_magnet_axes(Instrument(), data)
     assert str(path) in str(caught.value)
     in_si_and_magnet_axes(Instrument(**unit), data)
+
+
+@pytest.mark.parametrize(("row", "right"), [("0,0,0,0.57,1,1", 1.0), ("0,0,0,570,1,1", 1e-3)])
+def test_a_unit_the_wrong_way_round(tmp_path, row, right):
+    """1000 for 0.001: the map in T was said to be in mT, and 0.001 would have made it nothing."""
+    path = tmp_path / "map.csv"
+    path.write_text(HEADER + row + "\n", encoding="utf-8")
+    with pytest.raises(MeasurementError, match=r"flux_density_unit_T.* instead received 1000, with "
+                       r"which the map has .* Write 0.001, or leave it out if the map is in T"):
+        in_si_and_magnet_axes(Instrument(flux_density_unit_T=1000.0), read_map(path))
+    in_si_and_magnet_axes(Instrument(flux_density_unit_T=right), read_map(path))
