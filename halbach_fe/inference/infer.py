@@ -640,14 +640,22 @@ def _response(
 
 
 def with_instruments(study: Study, maps: Sequence[Map]) -> Study:
-    """Return a study with the instruments of some maps, its own."""
+    """Return a study with the instruments of some maps, its own.
+
+    An uncertain amplitude of the instrument that maps shared is that of each of them.
+    """
     own = [one for one in maps if not one.is_validation]
     if not study.maps:
         return study.with_(instrument=own[0].study.instrument)
-    return study.with_(maps=tuple(
-        each.with_(instrument=one.study.instrument)
-        if one.study.instrument != study.of_map(number).instrument else each
-        for number, (each, one) in enumerate(zip(study.maps, own, strict=True))))
+    changed = [number for number, one in enumerate(own)
+               if one.study.instrument != study.of_map(number).instrument]
+    shared = [f"maps[{number + 1}]." for number in changed if study.maps[number].instrument is None]
+    return study.with_(
+        maps=tuple(each.with_(instrument=own[number].study.instrument) if number in changed
+                   else each for number, each in enumerate(study.maps)),
+        uncertain=tuple(one.with_(change=one.change | {
+            place + name: value for name, value in one.change.items()
+            if name.startswith("instrument.") for place in shared}) for one in study.uncertain))
 
 
 def observation_of(
