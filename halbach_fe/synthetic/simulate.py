@@ -499,8 +499,17 @@ class DrawnMagnet:
 
 
 def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
-    """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
+    """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior.
+
+    Warns
+    -----
+    HalbachWarning
+        If the prior lets magnetizations vary inside blocks, which the truth cannot have.
+    """
     prior = study.prior
+    if prior.variation_sd:
+        warnings.warn(f"The blocks that are drawn for study {study.name} are uniformly magnetized: "
+                      "`prior.variation_sd` is left out.", HalbachWarning, stacklevel=2)
     shared = study.shared_sds
     common = (shared * generator.standard_normal(shared.shape[1])).sum(axis=1)
     single, turns = [], []
