@@ -58,11 +58,12 @@ from halbach_fe.response.block_variation import (
     neighbour_columns,
     neighbour_parameters,
     study_prior,
+    updated_field,
     with_magnetizations,
 )
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
-from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
+from halbach_fe.solver.routes import choose_route, field_function
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, stacked_root, with_independent
@@ -692,9 +693,8 @@ def _check_linearization(
     own = replace(session, folder=session.folder / "posterior")
     mean = mean[:len(magnet.parameter_names)]
     if choose_route(magnet, observation.points) == "moments":
-        updated = Magnet(magnet.study, with_magnetizations(magnet, mean))
-        true = observation.apply(solve_nominal(  # extrapolated, as the model is
-            updated, observation.points, own, estimate=True))
+        true = observation.apply(updated_field(  # extrapolated, as the model is
+            magnet, mean, observation.points, own, estimate=True))
     else:
         true = newton_readings(magnet, observation, own, mean[None])[0]
     others = np.zeros(len(model.parameters) - len(mean))
