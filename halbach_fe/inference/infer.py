@@ -58,11 +58,12 @@ from halbach_fe.response.block_variation import (
     neighbour_columns,
     neighbour_parameters,
     study_prior,
+    updated_field,
     with_magnetizations,
 )
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
-from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
+from halbach_fe.solver.routes import choose_route, field_function
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, stacked_root, with_independent
@@ -640,14 +641,22 @@ def _response(
 
 
 def with_instruments(study: Study, maps: Sequence[Map]) -> Study:
-    """Return a study with the instruments of some maps, its own."""
+    """Return a study with the instruments of some maps, its own.
+
+    An uncertain amplitude of the instrument that maps shared is that of each of them.
+    """
     own = [one for one in maps if not one.is_validation]
     if not study.maps:
         return study.with_(instrument=own[0].study.instrument)
-    return study.with_(maps=tuple(
-        each.with_(instrument=one.study.instrument)
-        if one.study.instrument != study.of_map(number).instrument else each
-        for number, (each, one) in enumerate(zip(study.maps, own, strict=True))))
+    changed = [number for number, one in enumerate(own)
+               if one.study.instrument != study.of_map(number).instrument]
+    shared = [f"maps[{number + 1}]." for number in changed if study.maps[number].instrument is None]
+    return study.with_(
+        maps=tuple(each.with_(instrument=own[number].study.instrument) if number in changed
+                   else each for number, each in enumerate(study.maps)),
+        uncertain=tuple(one.with_(change=one.change | {
+            place + name: value for name, value in one.change.items()
+            if name.startswith("instrument.") for place in shared}) for one in study.uncertain))
 
 
 def observation_of(
@@ -684,9 +693,8 @@ def _check_linearization(
     own = replace(session, folder=session.folder / "posterior")
     mean = mean[:len(magnet.parameter_names)]
     if choose_route(magnet, observation.points) == "moments":
-        updated = Magnet(magnet.study, with_magnetizations(magnet, mean))
-        true = observation.apply(solve_nominal(  # extrapolated, as the model is
-            updated, observation.points, own, estimate=True))
+        true = observation.apply(updated_field(  # extrapolated, as the model is
+            magnet, mean, observation.points, own, estimate=True))
     else:
         true = newton_readings(magnet, observation, own, mean[None])[0]
     others = np.zeros(len(model.parameters) - len(mean))

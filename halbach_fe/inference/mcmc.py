@@ -287,9 +287,9 @@ def _key(update: InferenceResult, model: NonlinearModel, chains: int, seed: int)
     iron = model.condensed
     noise = update.noise.covariance
     for part in (update.readings, noise.data, noise.indices, noise.indptr, update.held_out,
-                 update.prior.mean, update.prior.root, model.error, iron.linear, iron.readings,
-                 iron.potential, iron.weights, iron.stiffness.data, iron.gradient.data,
-                 iron.law.squares, iron.law.values):
+                 update.prior.mean, update.prior.root, model.error, model.offset, iron.linear,
+                 iron.readings, iron.potential, iron.weights, iron.stiffness.data,
+                 iron.gradient.data, iron.law.squares, iron.law.values):
         digest.update(np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
 

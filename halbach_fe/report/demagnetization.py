@@ -293,13 +293,14 @@ def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:
 def _layers(found: DemagnetizationMap) -> dict[str, Ints]:
     """Return the numbers of the cells to draw, by title of the panel.
 
-    The panels show the layer of cells nearest to z = 0 and the layer with the smallest margin;
-    a single panel if these are the same, or mirror images.
+    The panels show the layer of cells nearest to the middle along z and the layer with the smallest
+    margin; a single panel if these are the same, or mirror images.
     """
     z = found.cells.middles[:, 2].round(9)
-    middle = z[np.argmin(np.abs(z))]
-    worst = z[np.argmin(found.margin)]
-    if np.isclose(abs(worst), abs(middle)):
+    away = np.abs(z - found.magnet.middle_z_m)
+    nearest, least = np.argmin(away), np.argmin(found.margin)
+    middle, worst = z[nearest], z[least]
+    if np.isclose(away[least], away[nearest]):
         return {f"z = {round(1e3 * worst)} mm" if np.ptp(z) else "": np.flatnonzero(z == worst)}
     return {f"z = {round(1e3 * height)} mm{words}": np.flatnonzero(z == height)
             for height, words in ((middle, ""), (worst, ", smallest margin"))}

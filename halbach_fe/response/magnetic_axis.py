@@ -37,7 +37,7 @@ from halbach_fe.response.block_variation import (
     Deviations,
     distribution_of,
     neighbour_columns,
-    with_magnetizations,
+    updated_field,
 )
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
@@ -182,9 +182,8 @@ def _fields(
     own, others = session.within("axis"), neighbour_columns(magnet, points)
     if magnet.is_nonlinear:
         uniform = mean[:len(magnet.parameter_names)]
-        updated = Magnet(magnet.study, with_magnetizations(magnet, uniform))
         nominal = solve_nominal(magnet, points, own.within("nominal"))
-        field = solve_nominal(updated, points, own.within("updated"))
+        field = updated_field(magnet, uniform, points, own.within("updated"))
         columns = Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
         columns = np.concatenate([columns, others], axis=2)
         # variations inside blocks, and neighbours' blocks

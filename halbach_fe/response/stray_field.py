@@ -167,7 +167,8 @@ def stray_field(
         found = [_farthest(field, surface, near, radius * DISTANCES, limit_T)
                  for surface in (beside, beyond)]
         reached = max((distance for distance, _ in found), default=near)
-        planes = _planes(field, radius, half, near, max(wider * reached, radius / 2))
+        planes = _planes(field, (radius, half), magnet.middle_z_m, near,
+                         max(wider * reached, radius / 2))
     except PointsOutsideError:
         return StrayField(limit_T, radius, half, unknown=(
             "The mesh around the iron ends before the field has fallen to that."))
@@ -307,9 +308,12 @@ def _sd(
 
 
 def _planes(
-    field: Field, radius: float, half: float, near: float, far: float
+    field: Field, cylinder: tuple[float, float], middle_z_m: float, near: float, far: float
 ) -> tuple[StrayPlane, ...]:
-    """Return |B| in three planes, from one distance in m from the cylinder around to another."""
+    """Return |B| in three planes, from one distance in m from the ``cylinder`` around (radius and
+    half length in m) to another.
+    """
+    radius, half = cylinder
     # numbers of points of a plane's picture around the magnet, and outwards
     n_around, n_outward = 96, 20
     distances = np.geomspace(near, far, n_outward)[:, None]
@@ -323,7 +327,7 @@ def _planes(
     box = ((radius + distances) * along, (half + distances) * up)
     found = []
     for number, (across, (first, second)) in enumerate((("x", box), ("y", box), ("z", ring))):
-        points = np.zeros((*first.shape, 3))
+        points = np.full((*first.shape, 3), [0.0, 0.0, middle_z_m])
         a, b = (axis for axis in range(3) if axis != number)
         points[..., a], points[..., b] = first, second
         size = np.linalg.norm(field(points.reshape(-1, 3)), axis=1).reshape(first.shape)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from halbach_fe.core.arrays import Floats, Ints, plain, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import is_cross_section
@@ -50,6 +50,7 @@ from halbach_fe.solver.separate_blocks import (
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.study.external import External
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -528,7 +529,8 @@ def check_points(
     -----
     HalbachWarning
         If points are on a face, so far away that they may be in mm, or so near to the outer
-        boundary that its condition affects their field; if iron does not answer to external fields.
+        boundary that its condition affects their field; if iron does not answer to external fields,
+        or losses do not count them.
     """
     check_plane(magnet, points, key)
     places = magnet.surroundings(points)
@@ -545,7 +547,7 @@ def check_points(
     # only meshes have a boundary, beyond which the solve refuses points
     mesh = None if magnet.is_vacuum and magnet.study.solver.method == "reaction" else route.mesh
     for remark in (places.on_faces(), places.far_away() if mesh is None else None,
-                   _external_past_iron(magnet, points, route)):
+                   _external_past_iron(magnet, points, route), _external_beside_losses(magnet)):
         if remark is not None:
             warnings.warn(remark, HalbachWarning, stacklevel=2)
     if mesh is None:
@@ -578,3 +580,21 @@ def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | N
     size = np.linalg.norm(external_field(magnet, points), axis=1).max()
     return (f"The field of `external`, up to {1e3 * size:.3g} mT at the points, is added as if the "
             f"iron of study {magnet.name} were not there. Iron may change it by as much as it is.")
+
+
+def _external_beside_losses(magnet: Magnet) -> str | None:
+    """Return the sentence about an external field that irreversible losses do not count, None
+    without.
+    """
+    if not magnet.has_losses or magnet.external == External() or external_acts(magnet):
+        return None
+    # of the coercivity: a hundredth of the width of a usual knee, below which losses hardly change
+    weak = 1e-3
+    there = external_field(magnet, np.array([
+        block.mounted_middle for block in present_blocks(magnet.blocks)]))
+    size = float(np.linalg.norm(there, axis=1).max())
+    least = min(each.intrinsic_coercivity_A_per_m for each in magnet.demagnetizations)
+    return None if size < weak * MU_0 * least else (
+        f"The field of `external`, up to {1e3 * size:.3g} mT in the middles of the blocks, is left "
+        f"out of the irreversible losses of study {magnet.name}, which may be larger or smaller. "
+        "`halbach-fe demagnetization` counts it.")

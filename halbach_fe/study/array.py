@@ -295,7 +295,8 @@ class Array(_OfGrade):
         if rings and isinstance(rings, list | tuple):
             rings = values["ring"] = [one for ring in rings for one in _repeated(ring)]
             values.setdefault("rings", len(rings))
-            for key in ("blocks_per_ring", "inner_radius_m", "outer_radius_m", "block"):
+            for key in ("multipole_order", "blocks_per_ring", "inner_radius_m", "outer_radius_m",
+                        "block"):
                 found = [value for value in (_value(ring, key) for ring in rings)
                          if value is not None]
                 if values.get(key) is None and len(found) == len(rings):

@@ -629,7 +629,15 @@ def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generato
     """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior.
 
     Blocks of neighbouring magnets are others, with deviations of their own.
+
+    Warns
+    -----
+    HalbachWarning
+        If the prior lets magnetizations vary inside blocks, which the truth cannot have.
     """
+    if study.prior.variation_sd:
+        warnings.warn(f"The blocks that are drawn for study {study.name} are uniformly magnetized: "
+                      "`prior.variation_sd` is left out.", HalbachWarning, stacklevel=2)
     own = _drawn(study, nominal.bodies, generator)
     beside = tuple(body for each in study.external.neighbours for body in beside_magnet(
         each, _drawn(study, nominal.bodies, generator).mounted.bodies))
@@ -639,6 +647,9 @@ def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generato
 def _drawn(study: Study, nominal: tuple[Body, ...], generator: np.random.Generator) -> DrawnMagnet:
     """Draw the blocks of the magnet or of a neighbour."""
     prior = study.prior
+    if prior.variation_sd:
+        warnings.warn(f"The blocks that are drawn for study {study.name} are uniformly magnetized: "
+                      "`prior.variation_sd` is left out.", HalbachWarning, stacklevel=2)
     shared = study.shared_sds
     common = (shared * generator.standard_normal(shared.shape[1])).sum(axis=1)
     single, turns = [], []

@@ -7,6 +7,7 @@ import json
 import re
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import magpylib
 import meshio
@@ -19,7 +20,7 @@ from halbach_fe.design import demagnetization
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
-from halbach_fe.report.demagnetization import answer, demagnetization_summary, page
+from halbach_fe.report.demagnetization import _layers, answer, demagnetization_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.materials import MU_0, Demagnetization, grade
@@ -530,3 +531,16 @@ def test_studies_that_say_too_little_are_refused(dipole, session):
         demagnetization_map(build_magnet(dipole(array__material="N42SH")), session)
     with pytest.raises(ValueError, match="zero or negative"):
         Demagnetization(**COLD | {"coercivity_coefficient_per_K": -0.012, "temperature_C": 120.0})
+
+
+def test_the_picture_is_of_the_middle_of_a_magnet_anywhere():
+    """Its layers are the same wherever it stands; they were those nearest to z = 0."""
+    def layers(middle):
+        return list(_layers(SimpleNamespace(
+            cells=SimpleNamespace(middles=np.column_stack(2 * [np.zeros(5)] + [
+                middle + 0.01 * np.arange(-2, 3)])),
+            margin=np.array([5.0, 4.0, 3.0, 4.0, 1.0]),
+            magnet=SimpleNamespace(middle_z_m=middle))).values())
+
+    for middle in (0.0, 0.3):
+        assert layers(middle) == [[2], [4]]

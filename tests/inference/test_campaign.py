@@ -584,3 +584,26 @@ def test_bad_stages(keys, sentence):
             | ({"stage": "table"} if keys.get("stage") == "table" else {})]
     with pytest.raises(StudyError, match=sentence):
         parse_study(tomllib.loads(TEXT) | {"maps": maps})
+
+
+def test_an_amplitude_of_the_instrument_that_maps_share(generator, tmp_path):
+    """Once the pose was estimated, every map had an instrument of its own, and none the offset."""
+    offset_T, shift, magnet_of = 3e-3, np.array([3e-4, -2e-4, 4e-4]), truth(generator)
+    maps = {name: reading(magnet_of, generator, points, (Rotation.identity(), shift))
+            for name, points in (("body", BODY[::2]), ("fringe", FRINGE[::2]))}
+    for one in maps.values():
+        one["B_T"][:, 0] += offset_T
+    magnet = build_magnet(parse_study(tomllib.loads(TEXT) | {
+        "instrument_sd": {"translation_m": 1e-3},
+        "uncertain": [{"name": "offset", "sd": offset_T,
+                       "change": {"instrument.offset_T[1]": 1.0}}],
+        "maps": [{"name": name, "file": f"{name}.csv", "stage": "stage"} for name in maps]}))
+    result = infer(magnet, maps, Session.open(tmp_path))
+    (_, change, sd, _), = result.amplitudes.rows()
+    assert change == pytest.approx(offset_T, abs=4 * sd)
+    assert sd < 1e-4  # of hundreds of readings of 2e-5 T beside a field that is as uniform
+    assert result.disagreement == ""
+    # the study that is returned, too, has the amplitude in both maps
+    for number in range(2):
+        assert [one.change for one in result.study.of_map(number).uncertain] == [
+            {"instrument.offset_T[1]": 1.0}]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+import tomllib
 from dataclasses import replace
 
 import magpylib
@@ -15,7 +16,7 @@ import xarray as xr
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.infer import infer
+from halbach_fe.inference.infer import _check_linearization, infer
 from halbach_fe.inference.result import TOO_NEAR
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -37,6 +38,7 @@ from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import circle
 from tests.support.pages import page, write_result
+from tests.support.short_dipole import BODY, TEXT
 
 NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-5}]}
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
@@ -528,6 +530,20 @@ def test_iron_that_is_too_far_from_linear_is_said(dipole, generator, session):
     with pytest.warns(HalbachWarning, match="needs the non-linear posterior"):
         found = infer(build_magnet(study), data, session)
     assert "needs the non-linear posterior" in found.bent_iron
+
+
+def test_neighbours_do_not_change_as_the_blocks_do(generator, tmp_path):
+    """Their blocks are others: their field of the updated ones passed for iron that is bent."""
+    magnet = build_magnet(parse_study(tomllib.loads(TEXT) | {
+        "external": {"neighbours": [{"z_m": 0.08}]}}))
+    observation = observe(magnet.study, BODY[::5], np.ones((len(BODY[::5]), 3), bool))
+    session = Session.open(tmp_path)
+    model, sigma = response_matrix(magnet, observation, session), np.full(len(observation), 2e-5)
+    found = model.nominal * (1 + 0.02 * generator.standard_normal(len(model.nominal)))
+    assert _check_linearization(magnet, observation, session, model, found, sigma) == ""
+    bent = replace(model, offset=model.offset + 1e-5)  # the control
+    with pytest.warns(HalbachWarning, match=r"by 0\.5 of its error bar"):
+        _check_linearization(magnet, observation, session, bent, found, sigma)
 
 
 def test_the_turns_of_mounting_are_in_the_prior(tmp_path):

@@ -194,6 +194,17 @@ def test_longer_chains_go_on_from_shorter_ones_and_other_readings_do_not(campaig
     assert said[1].startswith("50 of 50")
 
 
+def test_chains_in_another_external_field_start_anew(campaign):
+    """A background is in the readings alone, not in the iron; the stored chains were taken up."""
+    update = campaign[3]
+    model = mcmc.nonlinear_model(
+        update.magnet, update.observation, room(campaign[4], "undisturbed"),
+        np.random.default_rng(1), update.prior)
+    own, again, other = (mcmc._key(update, replace(model, offset=model.offset + change), 4, 1)
+                         for change in (0.0, 0.0, 5e-5))
+    assert own == again != other
+
+
 def test_too_few_draws_are_refused(campaign):
     with pytest.raises(SamplingError, match=r"effective samples|do not agree"):
         sample_posterior(campaign[3], room(campaign[4], "short"), 20)

@@ -151,6 +151,16 @@ def test_the_pictures_show_the_field(tmp_path, magnet):
         assert plane.size_T[-1].max() < stray.limit_T < plane.size_T[0].max()
 
 
+def test_the_picture_across_z_is_in_the_middle_of_the_magnet(tmp_path):
+    """Of a magnet away from z = 0, too, where the plane z = 0 lies outside of it."""
+    far = changed(LONE, array__free_blocks=LONE["array"]["free_blocks"] | {"z_m": [0.3]})
+    plane = stray_field(build_magnet(parse_study(far)), Session.open(tmp_path)).planes[2]
+    cube = magpylib.magnet.Cuboid(dimension=3 * (CUBE_M,), polarization=(0, 0, REMANENCE_T))
+    at = np.stack([plane.first_m - 0.1, plane.second_m, 0 * plane.first_m], axis=-1)
+    size = np.linalg.norm(cube.getB(at.reshape(-1, 3)), axis=1)
+    assert plane.size_T.ravel() == pytest.approx(size, rel=1e-6)
+
+
 def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path, magnet):
     nominal, session = magnet.nominal_magnetization, Session.open(tmp_path)
     root = 0.01 * np.abs(nominal).max() * np.eye(len(nominal))

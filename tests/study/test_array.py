@@ -91,7 +91,9 @@ def test_rings_give_what_the_array_does_not():
     """Keys that all rings have need not be given once more."""
     ring = {key: COMMON[key] for key in COMMON if key != "ring_length_m"}
     array = study_of({"ring": [ring | {"ring_length_m": 0.05}] * 2}).array
-    assert (array.rings, array.blocks_by_ring) == (2, (16, 16))
+    assert (array.rings, array.blocks_by_ring, array.multipole_order) == (2, (16, 16), 1)
+    quadrupole = study_of({"ring": [ring | {"ring_length_m": 0.05, "multipole_order": 2}] * 2})
+    assert quadrupole.array.multipole_order == 2  # of which centre, axis and roll are asked
     one = {key: value for key, value in ring.items() if key not in ("block", "blocks_per_ring")}
     with pytest.raises(StudyError, match=r"array\.block"):
         study_of({"ring": [ring, one]})

@@ -252,6 +252,13 @@ def test_blocks_have_the_priors_spread(dipole):
     assert np.std(common) == pytest.approx(0.02, rel=0.16)
 
 
+def test_what_is_not_drawn_is_said(short_dipole):
+    """It looked as if magnetizations varied inside the blocks that were measured."""
+    study = short_dipole(prior={"variation_sd": 0.02, "variation_length_m": 0.02})
+    with pytest.warns(HalbachWarning, match=r"uniformly magnetized: `prior\.variation_sd`"):
+        draw_magnet(study, magnet_of(study), np.random.default_rng(1))
+
+
 def test_mounting_turns_magnetizations(short_dipole):
     """The block that the coil saw is not turned; 32 blocks of two angles that change it: 1/8."""
     study = short_dipole(prior={"mounting_sd_deg": 2.0})

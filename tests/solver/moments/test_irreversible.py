@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, root
 
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.magnets import magnet_of_blocks
+from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.moments.solve import KneeLaw, System, solve_irreversible
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import Session
@@ -185,6 +186,26 @@ def test_losses_of_cubes_of_two_grades():
         assert both[number] == pytest.approx(alone.pop(name)[number], abs=1e-5)
         (other,) = alone.values()
         assert np.abs(both[number] - other[number]).max() > 1e-3
+
+
+def test_losses_that_a_neighbour_would_make_are_named():
+    """One above opposes the cube, and takes a part of it that the field does not know of."""
+    magnet = magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "material": ["N42"],
+        **{f"size_{axis}_m": [SIDE] for axis in "xyz"}})
+    magnet = magnet.with_study(magnet.study.with_(array__material="N42", demagnetization=(
+        Demagnetization(**grade("N42").demagnetization_defaults, temperature_C=100.0,
+                        irreversible=True))))
+    point = np.array([[0.0, 2 * SIDE, 0.0]])
+    beside = magnet.with_(external__neighbours=[{"z_m": 1.2 * SIDE}])
+    with pytest.warns(HalbachWarning, match=r"up to 55\.2 mT in the middles .* left out of the irr"):
+        beside.field_T(point)
+    system = System.of(magnet.blocks)
+    law = KneeLaw.of(magnet.demagnetizations[0])
+    alone, opposed = (solve_irreversible(system, law, applied)[1].mean() for applied in (
+        None, lambda places: external_field(beside, places)))
+    assert opposed > 1.5 * alone > 0
+    magnet.with_(external__background_T=(5e-5, 0.0, 0.0)).field_T(point)  # nothing is said of it
 
 
 def test_newtons_steps_are_few(cube):
