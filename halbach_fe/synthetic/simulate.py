@@ -647,9 +647,6 @@ def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generato
 def _drawn(study: Study, nominal: tuple[Body, ...], generator: np.random.Generator) -> DrawnMagnet:
     """Draw the blocks of the magnet or of a neighbour."""
     prior = study.prior
-    if prior.variation_sd:
-        warnings.warn(f"The blocks that are drawn for study {study.name} are uniformly magnetized: "
-                      "`prior.variation_sd` is left out.", HalbachWarning, stacklevel=2)
     shared = study.shared_sds
     common = (shared * generator.standard_normal(shared.shape[1])).sum(axis=1)
     single, turns = [], []
