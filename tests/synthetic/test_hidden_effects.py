@@ -729,6 +729,26 @@ def test_an_object_within_a_single_block():
         campaign(cube, "ferromagnetic_object=0,0,0,1e-9")
 
 
+def test_an_object_beside_a_map_above_the_magnet():
+    """No height is both of the magnet and of the map: a traceback. It is drawn between them."""
+    above = changed(CUBOIDS, observation__positions={
+        "kind": "points", "points_m": [[0.01 * x, 0.0, 0.1] for x in range(-3, 4)]})
+    (object_,) = campaign(above, "ferromagnetic_object").truth["effects"]
+    place = {one["name"]: one["value"] for one in object_["parameters"]}
+    assert 0.08 <= place["z"] <= 0.1
+
+
+def test_an_object_within_iron():
+    ball = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.22, 0.0]}
+    study = parse_study(changed(RINGS, iron={"relative_permeability": 50.0, "bodies": [ball]}))
+    magnet = magnet_of(study)
+    for place, is_there in (((0.0, 0.21, 0.0), True), ((0.0, 0.3, 0.0), False)):
+        now = with_effects(magnet, site_of(study, magnet), [
+            ChosenEffect(EFFECTS["ferromagnetic_object"], (*place, 1e-9))])
+        with pytest.raises(StudyError, match="10 mm within iron") if is_there else nullcontext():
+            check_room(now, magnet)
+
+
 @pytest.mark.parametrize(("document", "texts", "by", "allowed"), [
     (RINGS, ["block_displaced=1,1,0,0.02,0"], 20, ["block_displaced=1,1,0,0.001,0"]),
     (SECTION, ["block_displaced=1,1,0,0.02,0"], 20, ["block_displaced=1,1,0,0.001,0"]),

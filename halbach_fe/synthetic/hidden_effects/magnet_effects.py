@@ -408,7 +408,9 @@ def _draw_object(site: Site, generator: np.random.Generator) -> tuple[float, ...
     """
     radius = (site.radius + site.inner) / 2 if site.radius < site.inner else 2 * site.outer
     angle = generator.uniform(0, 2 * np.pi)
-    z = generator.uniform(max(site.z_min, -site.half_length), min(site.z_max, site.half_length))
+    low, high = sorted((  # between magnet and map if these are at other heights
+        max(site.z_min, -site.half_length), min(site.z_max, site.half_length)))
+    z = generator.uniform(low, high)
     room = abs(site.inner - site.radius) / 2
     # a dipole of moment 3 V B / mu_0 changes the field at a distance d by up to 6 V B / (4 pi d^3)
     volume = log_uniform(generator, 5e-4, 5e-3) * 4 * np.pi / 6 * room**3
