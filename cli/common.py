@@ -243,17 +243,19 @@ def reference(arguments: argparse.Namespace) -> hf.MultipoleReference | None:
                                  arguments.at_z_m)
 
 
-def region_of(arguments: argparse.Namespace) -> hf.Region | None:
-    """Return the region that the options describe; None for the default one.
+def region_of(arguments: argparse.Namespace, magnet: hf.Magnet) -> hf.Region | None:
+    """Return the region of a magnet that the options describe; None for the default one.
 
     Raises
     ------
     StudyError
         If only its centre is given.
     """
+    from halbach_fe.response.region import default_centre
+
     region = hf.Region.of(arguments.sphere_m, arguments.ellipsoid_m, arguments.cylinder_m,
-                          arguments.centre_m)
-    if region is None and any(arguments.centre_m):
+                          arguments.centre_m or default_centre(magnet))
+    if region is None and arguments.centre_m:
         raise StudyError(must_be("--centre-m", "the command line", "beside a region",
                                  "given alone", "Add --sphere-m R."))
     return region

@@ -355,7 +355,8 @@ REGION = together(
            option("--cylinder-m", positive_number, ("R", "LENGTH"),
                   "radius and length along z in m", nargs=2)),
     option("--centre-m", finite_number, ("X", "Y", "Z"),
-           "centre of the region in m (default: 0 0 0)", nargs=3, default=(0.0, 0.0, 0.0)))
+           "centre of the region in m (default: that of the study's region, or the middle of the "
+           "magnet)", nargs=3))
 """Options that describe a region."""
 
 

@@ -179,7 +179,8 @@ def homogeneity(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """
     from halbach_fe.response.region import SHOWN_DEGREES
 
-    within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
+    within_it = common.region_of(arguments, magnet)
+    posterior = common.posterior_of(arguments, magnet)
     if not arguments.measurements and describes_a_format(arguments):
         raise CommandLineError(must_be(
             "options of the format", "the command line", "beside --measurements, whose map they "
@@ -252,7 +253,8 @@ def design(arguments: argparse.Namespace) -> int:
     """
     study = hf.read_study(arguments.study)
     with common.session(arguments, study) as session:
-        found = hf.design_rings(study, session, common.region_of(arguments), arguments.seed)
+        region = common.region_of(arguments, hf.build_magnet(study))
+        found = hf.design_rings(study, session, region, arguments.seed)
     return common.finish(arguments, found)
 
 
@@ -399,7 +401,8 @@ def shim_tray(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """
     from halbach_fe.inference.storage import read_posterior
 
-    within_it, stored = common.region_of(arguments), read_posterior(magnet, arguments.posterior)
+    within_it = common.region_of(arguments, magnet)
+    stored = read_posterior(magnet, arguments.posterior)
     with common.session(arguments, magnet.study) as session:
         return replace(hf.shim_tray(magnet, session, stored["posterior"], within_it),
                        disagreement=stored.disagreement)

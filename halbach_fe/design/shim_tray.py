@@ -32,7 +32,7 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import distributions_of
 from halbach_fe.response.block_variation import distribution_of, with_variations
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, homogeneity_model
-from halbach_fe.response.region import Region, default_region
+from halbach_fe.response.region import Region, default_centre, default_region
 from halbach_fe.solver.exact_block_field import unit_field
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
@@ -101,7 +101,11 @@ class FilledTray(ShownInNotebook):
     @property
     def filled_study(self) -> Study | None:
         """The study with the magnets of the tray as free blocks; None if the tray stays empty."""
-        return _with_free_blocks(self.magnet.study, self.filled) if self.filled else None
+        if not self.filled:
+            return None
+        study = _with_free_blocks(self.magnet.study, self.filled)
+        return study if study.homogeneity is None else study.with_(  # not moved by its shims
+            homogeneity__centre_m=default_centre(self.magnet))
 
 
 @alone

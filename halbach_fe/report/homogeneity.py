@@ -44,8 +44,8 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import best_known, decimals, flux_density, ppm, with_error, with_unit
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
+from halbach_fe.response.region import default_centre
 from halbach_fe.response.stray_field import NEAREST, StrayField
-from halbach_fe.study.model import Study
 
 CONVENTION = (
     "B_n = sum (r/R)^l P_lm(cos theta) (a_lm cos(m phi) + b_lm sin(m phi)) about the centre, B_n "
@@ -111,18 +111,21 @@ def answer(found: HomogeneityResult) -> Answer:
                  f"ppm rms, and 95 % have {low} to {high} ppm")
         reason = "Yes, as far as the study's tolerances are right: it is no measured magnet."
     if best.rms_ppm > too_large_for_a_tray:
-        step = _better_design(found.magnet.study, best.rms_ppm)
+        step = _better_design(found, best.rms_ppm)
     return Answer(question, f"{text}.", f"{reason} {trust}", *step, small, numbers=numbers)
 
 
-def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:
+def _better_design(found: HomogeneityResult, rms_ppm: float) -> tuple[str, str]:
     """Say what to do about the deviation of a magnet as designed, and the command for it."""
+    study, (x, y, z) = found.magnet.study, found.model.region.centre_m
     part = f"A deviation of {decimals(1e-4 * rms_ppm, 2)} % is that of the "
     tray = "Small magnets in a tray cannot make up for it."
     if obstacle(study) is not None:  # halbach-fe design would refuse this magnet
+        there = ("" if (x, y, z) == default_centre(found.magnet) else
+                 f" --centre-m {x:g} {y:g} {z:g}")
         return (f"{part}magnet as designed, not of its errors: move its blocks, or look at a "
                 f"smaller region: set R, its radius. {tray}",
-                "halbach-fe homogeneity STUDY --sphere-m R -o DIR")
+                f"halbach-fe homogeneity STUDY --sphere-m R{there} -o DIR")
     stated = "" if study.design is not None else ", by a table [design] in the study"
     return (f"{part}rings, not of their errors: look for better rings{stated}, or for a smaller "
             f"region. {tray}", "halbach-fe design STUDY -o DIR")

@@ -92,7 +92,13 @@ def answer(plan: MeasurementPlan) -> Answer:
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
         "difference to these numbers. Positions that are chosen one after another, as these are, "
         "tell nearly as much as the best choice of all at once.",
-        _of_the_instrument(study), linearized(study)]
+        _left_out(study), linearized(study)]
+    if _is_worse(plan):
+        return Answer(
+            "Where should the magnet be measured?", " ".join(filter(None, said)),
+            "Only among these candidates: the study's own positions tell more.", "State "
+            "plan.candidates that are nearer to the blocks, or leave them out: then those of the "
+            "study are taken.", "halbach-fe plan STUDY -o DIR", sound=False)
     step = ("Measure in this order, as far as there is time, and update the blocks. (Set "
             "plan.points for a shorter plan, or plan.candidates for other places.)"
             if _has_all(plan) else "Measure there, and update the blocks."
@@ -130,9 +136,10 @@ def _left_of_patterns(plan: MeasurementPlan) -> list[str]:
     vague, little = 0.7, 0.97
     left, of_study = _patterns(plan)
     blocks = rms(plan.planned_sd) / rms(plan.prior_sd)
+    rest = ", so that these are better places" if _is_worse(plan) else ", which is hardly more"
     beside = "" if _is_the_study(plan) else (
         f"; with as many of the study's own positions to {fraction(of_study)}"
-        f"{'' if left < little * of_study else ', which is hardly more'}")
+        f"{'' if left < little * of_study else rest}")
     together, pattern = (
         ("What blocks that deviate together do to the field is known better: the",
          "such a pattern") if left < blocks else ("The", "patterns of blocks"))
@@ -142,8 +149,17 @@ def _left_of_patterns(plan: MeasurementPlan) -> list[str]:
         f"{together} uncertainty of {pattern}, by which the positions are chosen, falls to "
         f"{fraction(left)} (geometric mean){beside}.",
         "So such a map tells little of the single blocks, at whatever positions of these it is "
-        "measured. Measure the blocks before assembly, or the field nearer to them."
-        if left > vague else ""]
+        "measured." if left > vague else "",
+        "Measure the blocks before assembly, or the field nearer to them."
+        if left > vague and not _is_worse(plan) else ""]
+
+
+def _is_worse(plan: MeasurementPlan) -> bool:
+    """Tell whether as many of the study's own positions tell clearly more than those chosen."""
+    if plan.deviation is not None:
+        return bool(plan.deviation.planned[-1] > NEARLY * _of_study(plan))
+    left, of_study = _patterns(plan)
+    return bool(left > NEARLY * of_study)
 
 
 def _left_of_deviation(plan: MeasurementPlan) -> str:
@@ -170,11 +186,15 @@ def _beside_all_of_the_study(plan: MeasurementPlan) -> str:
             f"{len(plan.points)}: they leave {of_all}.")
 
 
-def _of_the_instrument(study: Study) -> str:
-    """Say what of the instrument the plan takes as known, though the study does not."""
-    return "" if not study.instrument_sd.drift_T else (
+def _left_out(study: Study) -> str:
+    """Say what an update with such a map would not know or not use, though the plan counts it."""
+    drift = "" if not study.instrument_sd.drift_T else (
         "The drift that [instrument_sd] leaves open is not in them, as it needs the order of the "
         "readings.")
+    held_out = "" if study.inference.held_out is None else (
+        "All readings count in them: an update leaves more, by what [inference.held_out] sets "
+        "aside.")
+    return " ".join(filter(None, (drift, held_out)))
 
 
 def _of_the_stage(instrument: Instrument) -> str:

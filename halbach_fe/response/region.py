@@ -533,9 +533,16 @@ def default_region(magnet: Magnet) -> Region:
     """Return the region of the study, or the sphere about the magnet of half the bore's radius."""
     asked = magnet.study.homogeneity
     own = None if asked is None else Region.of(
-        asked.sphere_m, asked.ellipsoid_m, asked.cylinder_m, asked.centre_m)
+        asked.sphere_m, asked.ellipsoid_m, asked.cylinder_m, default_centre(magnet))
     inside = 0.5  # radius of the default sphere, relative to that of the bore
-    return own or Region.sphere(inside * magnet.bore_radius, (0.0, 0.0, magnet.middle_z_m))
+    return own or Region.sphere(inside * magnet.bore_radius, default_centre(magnet))
+
+
+def default_centre(magnet: Magnet) -> tuple[float, float, float]:
+    """Return the centre in m of the study's region, or the middle of the magnet on the z axis."""
+    asked = magnet.study.homogeneity
+    stated = None if asked is None else asked.centre_m
+    return stated or (0.0, 0.0, magnet.middle_z_m)
 
 
 Distance = Callable[[Floats], Floats]

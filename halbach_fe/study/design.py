@@ -84,15 +84,16 @@ class HomogeneityRegion(StudyModel):
     """The region in which the field is to be homogeneous (in MRI: the DSV).
 
     It is a sphere of radius ``sphere_m``, an ellipsoid of half axes ``ellipsoid_m`` along x, y and
-    z, or a cylinder along z of radius and length ``cylinder_m``, about ``centre_m``. A study with
-    this table asks for a homogeneous field: `tolerance` and `sort` work for the deviation of |B|
-    in the region in ppm, instead of for multipoles.
+    z, or a cylinder along z of radius and length ``cylinder_m``, about ``centre_m`` (default: the
+    middle of the magnet along z, on the z axis). A study with this table asks for a homogeneous
+    field: `tolerance` and `sort` work for the deviation of |B| in the region in ppm, instead of for
+    multipoles.
     """
 
     sphere_m: Length | None = None
     ellipsoid_m: tuple[Length, Length, Length] | None = None
     cylinder_m: tuple[Length, Length] | None = None
-    centre_m: Point = (0.0, 0.0, 0.0)
+    centre_m: Point | None = None
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:

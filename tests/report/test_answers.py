@@ -929,6 +929,28 @@ def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     assert "the first 1 " not in vague
 
 
+def test_candidates_that_tell_less_than_the_study_are_no_places_to_measure(given):
+    """Of far candidates the page said that the study's own positions tell "hardly more"."""
+    far = given.magnet.with_(plan={"candidates": [{
+        "kind": "line", "start_m": (0.3, 0.0, 0.0), "end_m": (0.34, 0.0, 0.0), "count": 5}]})
+    said = plan.answer(hf.plan(far, given.session, points=3))
+    assert "so that these are better places" in said.said
+    assert "hardly more" not in said.said
+    assert not said.sound
+    assert "plan.candidates" in said.step
+    near = plan.answer(hf.plan(given.magnet, given.session, points=3))  # the control
+    assert near.sound
+    assert "better places" not in near.said
+
+
+def test_a_plan_says_that_its_readings_are_not_held_out(given):
+    """The update that it advises holds some out; without such readings nothing is said."""
+    trust = [plan.answer(hf.plan(given.magnet.with_(inference={"held_out": held_out}),
+                                 given.session, points=3)).trust
+             for held_out in ({"every": 4}, None)]
+    assert ["inference.held_out" in each for each in trust] == [True, False]
+
+
 def test_an_update_without_circles_states_its_strongest_reading(given):
     """The control has a table of multipoles, whose main one is said instead."""
     said = inference_answer.answer(given.updated).said

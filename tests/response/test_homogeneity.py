@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import tomllib
 from dataclasses import replace
@@ -16,6 +17,7 @@ from scipy.stats import qmc
 
 from halbach_fe.api import homogeneity
 from halbach_fe.cli import main
+from halbach_fe.cli.common import region_of
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
@@ -438,6 +440,13 @@ def test_the_region_of_a_magnet_away_from_the_origin(tmp_path):
         assert getattr(found.by_name["prior"], name) == pytest.approx(
             getattr(here.by_name["prior"], name), rel=1e-6)
     assert "about (0, 0, 300) mm" in answer(found).question
+    asked = there.with_(homogeneity={"sphere_m": 0.01})
+    assert default_region(asked) == Region.sphere(0.01, (0.0, 0.0, there.middle_z_m))
+    stated = there.with_(homogeneity={"sphere_m": 0.01, "centre_m": (0.0, 0.0, 0.0)})
+    assert default_region(stated) == Region.sphere(0.01)
+    options = argparse.Namespace(sphere_m=0.02, ellipsoid_m=None, cylinder_m=None, centre_m=None)
+    assert region_of(options, there) == Region.sphere(0.02, (0.0, 0.0, there.middle_z_m))
+    assert region_of(options, stated) == Region.sphere(0.02)
     before = homogeneity(there, session, default_region(ring)).by_name["prior"]
     assert before.mean_T < 0.1 * here.by_name["prior"].mean_T
 
