@@ -4,7 +4,8 @@ The bars are those of every reading. NGSolve meshes blocks and iron together, of
 part, and shares no code with the field that it judges. Its elements are of order 4, and small
 along the edges of iron: with elements of 2.1 mm throughout it was 5e-4 of the main field off
 between the plates, as much as is asked of what it judges; by 1.2 and 0.6 mm along edges the field
-differs by 1.4e-4.
+differs by 1.4e-4. Of the undulator, whose poles saturate, they are small at the tips: with 4.2 mm,
+and 2 mm along all edges, it was 1.2e-3 rms off.
 """
 
 from __future__ import annotations
@@ -80,9 +81,9 @@ def by_ngsolve(**elements: Any) -> Truth:
         magnet_of(magnet.study), points, Elements(**elements))
 
 
-def finely(size_m: float, edge_m: float, *mirrored: int) -> Truth:
+def finely(size_m: float, edge_m: float, *mirrored: int, tip: float | None = None) -> Truth:
     """Return the truth with elements of order 4, of what is not ``mirrored``."""
-    return by_ngsolve(size=size_m, edge=edge_m, order=4, mirrored=mirrored)
+    return by_ngsolve(size=size_m, edge=edge_m, order=4, mirrored=mirrored, tip=tip)
 
 
 def back_plate() -> tuple[dict[str, Any], Floats, Truth]:
@@ -173,7 +174,7 @@ def undulator() -> tuple[dict[str, Any], Floats, Truth]:
              "repeats": 6, "step_m": [0.0, 0.0, 0.02], "mirrored": ["y"]}]}, 0.02, 1.8)
     points = np.array([[x, y, z] for x in (0.0, 0.005) for y in (-0.004, 0.0, 0.004)
                        for z in np.linspace(-0.03, 0.03, 13)])
-    return study, points, finely(0.0042, 0.002, 1, -1, -1)
+    return study, points, finely(0.005, 0.002, 1, -1, -1, tip=0.0008)
 
 
 CASES = {"sphere": sphere, "plates": plates_on_cubes, "quadrupole": quadrupole, "c_yoke": c_yoke,
@@ -381,7 +382,7 @@ def mean_flux(iron: BodiesReaction) -> Floats:
 def team13(note: Note) -> None:
     """Compare the mean flux density in the steel, and the field in the air, with measured ones."""
     def solve(current_A: float) -> tuple[Magnet, BodiesReaction]:
-        magnet = build_magnet(parse_study(plates(2.2, current_A)))
+        magnet = build_magnet(parse_study(plates(2.9, current_A)))
         with tempfile.TemporaryDirectory() as folder:
             iron = solve_separate(magnet, Session(find_getdp(), Path(folder))).iron
         assert isinstance(iron, BodiesReaction)

@@ -79,6 +79,10 @@ class Elements:
     edge: float | None = None
     """Size along the edges of iron, where the field is singular, in three dimensions; by default
     only the ends of tubes have smaller elements. In m."""
+    tip: float | None = None
+    """With ``size`` and ``edge``, size along edges whose middles are within two elements of a
+    point, and half as fine on such faces: the tip of a pole that saturates is magnetized least
+    evenly, next to where its field is asked for. In m."""
 
 
 def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None = None) -> Floats:
@@ -90,11 +94,11 @@ def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None
         return np.zeros((len(points), 3))
     elements, size = elements or Elements(), magnet.dimension
     with import_extra("ngsolve").TaskManager():
-        mesh = mesh_of(magnet, points, elements)
-        potential = solve_potential(magnet, mesh, elements.order or USUAL_ORDER[size])
         mirrored = np.flatnonzero(elements.mirrored)
         near = points[:, :size].copy()
         near[:, mirrored] = np.abs(near[:, mirrored])
+        mesh = mesh_of(magnet, near, elements)
+        potential = solve_potential(magnet, mesh, elements.order or USUAL_ORDER[size])
         places, moments = _response(magnet, mesh, potential, near)
     for axis in mirrored:
         sign = np.full(size, float(elements.mirrored[axis]))
@@ -236,6 +240,7 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
         _name(parts[-1], iron.region(number) if iron else "", flat)
         if elements.edge and not flat:
             parts[-1].edges.maxh = elements.edge
+            _refine_tip(parts[-1], points, elements)
     for part, size in zip(parts, sizes, strict=True):
         (part.faces if flat else part).maxh = size
     if not flat and elements.size is None:
@@ -373,6 +378,18 @@ def _iron_in_own_axes(body: Tube | Pole | Ball, flat: bool) -> Any:
     cylinder = occ.Cylinder(axis, body.outer, 2 * body.half_length)
     return (cylinder - occ.Cylinder(axis, body.inner, 2 * body.half_length) if body.inner
             else cylinder)
+
+
+def _refine_tip(solid: Any, points: Floats, elements: Elements) -> None:
+    """Make elements small where iron is next to points (n, 3) in m, see `Elements.tip`."""
+    if elements.tip is None or elements.size is None:
+        return
+    beside, places = 2 * elements.size, KDTree(points)
+    for parts, size in ((solid.edges, elements.tip), (solid.faces, 2 * elements.tip)):
+        for part in parts:
+            middle = part.center
+            if places.query((middle.x, middle.y, middle.z))[0] < beside:
+                part.maxh = size
 
 
 def _refine_ends(body: Tube, solid: Any, size: float) -> None:
