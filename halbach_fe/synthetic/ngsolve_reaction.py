@@ -81,7 +81,7 @@ class Elements:
     only the ends of tubes have smaller elements. In m."""
     tip: float | None = None
     """With ``size`` and ``edge``, size along edges whose middles are within two elements of a
-    point, and half as fine on such faces: the tip of a pole that saturates is magnetized least
+    point, and twice that on such faces: the tip of a pole that saturates is magnetized least
     evenly, next to where its field is asked for. In m."""
 
 

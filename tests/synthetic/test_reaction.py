@@ -169,7 +169,7 @@ def test_iron_of_every_kind_in_three_dimensions():
 
 def test_elements_are_small_at_the_ends_of_tubes():
     """Vertices on the rims of a tube are hardly farther apart than it is thick, unless a size is
-    asked for, which is the control.
+    asked for, which is the control. By a point next to it an edge has the size of a tip.
     """
     thickness, outer, half = 0.01, 0.1, 0.02
     iron = {"relative_permeability": 100.0, "bodies": [
@@ -177,8 +177,8 @@ def test_elements_are_small_at_the_ends_of_tubes():
          "length_m": 2 * half, "z_m": 0.0}]}
     magnet = magnet_of(study_of({"free_blocks": table_of(PLAIN)}, iron=iron))
 
-    def farthest(elements):
-        mesh = ngsolve_reaction.mesh_of(magnet, POINTS, elements)
+    def farthest(elements, points=POINTS):
+        mesh = ngsolve_reaction.mesh_of(magnet, points, elements)
         places = np.array([vertex.point for vertex in mesh.vertices])
         rim = (np.abs(np.hypot(*places[:, :2].T) - outer) < 1e-6) & (
             np.abs(places[:, 2] - half) < 1e-6)
@@ -188,6 +188,9 @@ def test_elements_are_small_at_the_ends_of_tubes():
     assert farthest(Elements()) < 1.3 * thickness
     assert farthest(Elements(0.03)) > 1.7 * thickness
     assert farthest(Elements(0.03, edge=0.004)) < 1.3 * 0.004
+    tip, middle = Elements(0.03, edge=0.01, tip=0.004), np.array([[0.0, 0.0, half]])
+    assert farthest(tip, middle) < 1.3 * 0.004
+    assert farthest(tip, 2 * middle + 0.1) > 1.7 * 0.004
 
 
 def test_block_table_of_a_magnet_of_all_kinds():
