@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.field_map import (
     MAX_FIELD_T,
@@ -258,12 +259,13 @@ def map_time(data: xr.Dataset) -> Floats:
 
 
 def row_order_note(study: Study) -> str:
-    """Say that a lag or a memory of the instrument follows from the order of rows; else nothing."""
+    """Say that a lag, memory or drift follows from the order of rows; else nothing."""
     instruments = [study.instrument, *(one.instrument for one in study.maps if one.instrument)]
     named = [what for what, there in (
         ("a lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
-        ("a memory of the reading before", any(one.memory for one in instruments))) if there]
-    return (f"The study has {' and '.join(named)}. It counts on rows in the order in which they "
+        ("a memory of the reading before", any(one.memory for one in instruments)),
+        ("a drift (drift_T)", any(any(one.drift_T) for one in instruments))) if there]
+    return (f"The study has {in_a_row(named)}. It counts on rows in the order in which they "
             "were read: a table that was sorted or joined makes it wrong. By a "
             "column time_s a wrong order is seen." if named else "")
 

@@ -61,6 +61,8 @@ def test_a_lag_is_named(session, generator):
     assert not row_order_note(found.before.study)
     assert "(lag_m) and a memory" in row_order_note(STUDY.with_(
         instrument={"lag_m": LAG_M, "memory": 0.01}))
+    assert "has a drift (drift_T). It" in row_order_note(STUDY.with_(
+        instrument={"drift_T": (0.0, 1e-4, 0.0)}))
     # control: without it the update does not agree
     assert found.before.prior_conflict > found.before.conflict_limit
 
