@@ -97,7 +97,7 @@ def solved(study):
 
 
 FEWER = {"block_turned": 1, "ferromagnetic_object": 1, "corners_demagnetized": 8,
-         "wrong_radius": 5}
+         "ring_tilted": 5, "wrong_radius": 5}
 """Prior standard deviations that a study can have of effects of which it cannot have ten."""
 
 
