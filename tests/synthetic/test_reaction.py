@@ -187,10 +187,10 @@ def test_elements_are_small_at_the_ends_of_tubes():
 
     assert farthest(Elements()) < 1.3 * thickness
     assert farthest(Elements(0.03)) > 1.7 * thickness
-    assert farthest(Elements(0.03, edge=0.004)) < 1.3 * 0.004
-    tip, middle = Elements(0.03, edge=0.01, tip=0.004), np.array([[0.0, 0.0, half]])
-    assert farthest(tip, middle) < 1.3 * 0.004
-    assert farthest(tip, 2 * middle + 0.1) > 1.7 * 0.004
+    assert farthest(Elements(0.03, edge=0.006)) < 1.3 * 0.006
+    tip, middle = Elements(0.03, edge=0.015, tip=0.006), np.array([[0.0, 0.0, half]])
+    assert farthest(tip, middle) < 1.3 * 0.006
+    assert farthest(tip, 2 * middle + 0.1) > 1.7 * 0.006
 
 
 def test_block_table_of_a_magnet_of_all_kinds():
