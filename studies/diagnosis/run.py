@@ -510,21 +510,32 @@ def true_amplitudes(effect: str, hidden: dict[str, float]) -> list[float]:
     return []
 
 
+def values_of(hidden: dict[str, Any]) -> dict[str, float]:
+    """Return the parameters of a hidden effect by their names."""
+    return {each["name"]: each["value"] for each in hidden["parameters"]}
+
+
+def widened(seam: float, truth: Sequence[dict[str, Any]]) -> float:
+    """Return by how much in m hidden shifts of the rings beside a seam widen its gap."""
+    shifts = [values_of(hidden) for hidden in truth if hidden["name"] == "ring_shifted_along"]
+    return sum(one["z"] * ((one["ring"] == seam + 1) - (one["ring"] == seam)) for one in shifts)
+
+
 def amplitude_errors(result: dict[str, Any]) -> list[float]:
     """Return amplitudes minus their true values in standard deviations, of right names.
 
-    An amplitude that is exactly 0, as another part of an effect was likelier, has none. Nor has
-    that of a gap beside a ring that is shifted along: what is found is the sum of both.
+    An amplitude that is exactly 0, as another part of an effect was likelier, has none. A gap of
+    which a ring beside it is shifted along, too, is as wide as both make it.
     """
     found: list[float] = []
-    if {"ring_gap", "ring_shifted_along"} <= {hidden["name"] for hidden in result["truth"]}:
-        return found
     for one in result.get("identified", []):
         for hidden in result["truth"]:
             labels = result["labels"].get(hidden["name"]) or []
             if one["effect"] in known_as(hidden["name"]) and all(
                     label in one["place"] for label in labels):
-                values = {each["name"]: each["value"] for each in hidden["parameters"]}
+                values = values_of(hidden)
+                if one["effect"] == "ring_gap":
+                    values["distance"] += widened(values["seam"], result["truth"])
                 found += [(value - true) / sd for value, true, sd in zip(
                     one["values"], true_amplitudes(one["effect"], values), one["sd"],
                     strict=False) if sd > 0]

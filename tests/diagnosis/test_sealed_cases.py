@@ -173,6 +173,12 @@ def test_a_gap_is_compared_with_that_at_its_seam(study):
     assert study.wrong(one) == 0
     # the control: where the gap is at another seam, so is its name
     assert study.wrong(one | {"labels": labels | {"ring_gap": ["r03"]}}) == 1
+    # rings beside the seam that are shifted widen it; of the control, ring 3, they do not
+    for ring, z, expected in ((1.0, -4e-5, -1.0), (2.0, 4e-5, -1.0), (3.0, 4e-5, 1.0)):
+        shifted = {"name": "ring_shifted_along", "parameters": [
+            {"name": "ring", "value": ring}, {"name": "z", "value": z}]}
+        assert study.amplitude_errors(one | {"truth": [*one["truth"], shifted]}) == pytest.approx(
+            [expected])
 
 
 @pytest.mark.parametrize("name", ["clipped", "quantized", "warming", "lead_screw", "cable"])
