@@ -500,10 +500,9 @@ def field(
              else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
     most = 0.01
-    if (spacing := found.relative_spacing) > most:
-        of_it = f"{100 * spacing:.2g} % of" if spacing < 1 else "more than"
+    if found.relative_spacing > most:
         warnings.warn(f"The {lines.count} points of a line are too far apart for its integrals: "
-                      f"that makes {of_it} the integral of |B|, which is in their error bars. Take "
+                      f"that makes {found.spacing_in_words}, which is in their error bars. Take "
                       "more points (--count), or shorter lines.", HalbachWarning, stacklevel=2)
     return replace(found, measured=posterior is not None,
                    disagreement=disagreement_of(posterior, magnet))

@@ -205,15 +205,19 @@ class FieldOnLines(ShownInNotebook):
         return float(self.spacing.max() / max(whole, nothing_T * self.lines.length))
 
     @property
+    def spacing_in_words(self) -> str:
+        """Say how large the largest `spacing` is beside the largest integral of |B|."""
+        share = self.relative_spacing
+        return f"{f'{100 * share:.2g} % of' if share < 1 else 'more than'} the integral of |B|"
+
+    @property
     def without_integrals(self) -> str:
         """Say that the points are too far apart for the integrals to be known, or nothing."""
         known = 0.1  # part of the integral of |B|, up to which an error bar may stand beside it
-        share = self.relative_spacing
-        if share <= known:
+        if self.relative_spacing <= known:
             return ""
-        of_it = f"{100 * share:.2g} % of" if share < 1 else "more than"
         return (f"the {self.lines.count} points of a line are too far apart, which makes an error "
-                f"of {self.spacing.max():.2g} T m, {of_it} the integral of |B|")
+                f"of {self.spacing.max():.2g} T m, {self.spacing_in_words}")
 
     def _integrated(self, values: Floats, order: int = 1) -> Floats:
         """Return the integrals (lines, count, ...) from the start of a line to every point."""
