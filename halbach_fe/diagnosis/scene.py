@@ -70,8 +70,6 @@ class ScannedMap:
         |B| has one sensor, without axes; a planar Hall effect needs all components, and a lag rows
         in the order in which they were read.
         """
-        if not effect.can_show(self.points):
-            return False
         if effect.kind == "field" or effect.of_total_field:
             return self.is_total or not effect.of_total_field
         try:
@@ -165,13 +163,12 @@ class Campaign:
         Maps that cannot show it have none.
         """
         if effect.kind == "field" or not self.is_listed:
-            maps = [one for one in self.maps if not one.is_validation
-                    and effect.can_show(one.points)]
+            maps = [one for one in self.maps if not one.is_validation]
             return [place for place in (effect.places(study) if maps else ()) if any(
                 one.can_have(effect, place, study) for one in maps)]
         found: dict[Place, list[str]] = {}
         for one in self.maps:
-            if one.number is None or not effect.can_show(one.points):
+            if one.number is None:
                 continue
             own = one.study_of(study)
             for place in effect.places(own):

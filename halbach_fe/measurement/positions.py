@@ -11,7 +11,6 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.study.measurement import GridPositions, Positions
@@ -176,27 +175,6 @@ def follows_times(points: Floats, time: Floats) -> bool:
     if by_time.any(axis=1).sum() <= by_row.any(axis=1).sum() / 2:
         return True
     return bool(np.mean(np.linalg.norm(by_time - by_row, axis=1) > other_way) <= few)
-
-
-def goes_both_ways(points: Floats) -> bool:
-    """Tell whether many of a map's points (n, 3) were come to against the way to the nearest point
-    of another line.
-    """
-    # number of points that show how a stage moves
-    enough = 2000
-    points = points[:enough]
-    way = motion(points)
-    moved = way.any(axis=1)
-    line = np.cumsum(~moved)[moved]
-    if len(np.unique(line)) < 2:
-        return False
-    apart = cdist(points[moved], points[moved])
-    apart[line[:, None] == line] = np.inf
-    other = way[moved][apart.argmin(axis=1)]
-    # cosine of the angle between two ways below which they are opposite, and share of points with
-    # such a neighbour that are many
-    against, many = -0.5, 0.2
-    return bool(np.mean(np.sum(way[moved] * other, axis=1) < against) > many)
 
 
 def held_out_lines(lines: Ints, every: int) -> NDArray[np.bool_]:

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.installation import import_extra
-from halbach_fe.measurement.positions import goes_both_ways, motion, points_from
+from halbach_fe.measurement.positions import motion, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -428,6 +429,27 @@ OF_OWN_SIZE = ("clipped", "quantized")
 
 TO_AND_FRO = ("backlash", "lag_one_way")
 """Those of a stage that comes back."""
+
+
+def goes_both_ways(points: Floats) -> bool:
+    """Tell whether many of a map's points (n, 3) were come to against the way to the nearest point
+    of another line.
+    """
+    # number of points that show how a stage moves
+    enough = 2000
+    points = points[:enough]
+    way = motion(points)
+    moved = way.any(axis=1)
+    line = np.cumsum(~moved)[moved]
+    if len(np.unique(line)) < 2:
+        return False
+    apart = cdist(points[moved], points[moved])
+    apart[line[:, None] == line] = np.inf
+    other = way[moved][apart.argmin(axis=1)]
+    # cosine of the angle between two ways below which they are opposite, and share of points with
+    # such a neighbour that are many
+    against, many = -0.5, 0.2
+    return bool(np.mean(np.sum(way[moved] * other, axis=1) < against) > many)
 
 
 def can_have(study: Study, outside: str) -> bool:

@@ -154,7 +154,7 @@ def test_the_current_of_a_coil(fraction, session, generator):
     (named,) = diagnose(study, shown, session, effects=some).identified
     assert named.hypothesis.key == ("coil_current", Place(slot=2, words="coil 2"))
     assert named.values == pytest.approx([fraction], abs=4 * named.sd[0])
-    assert named.sd[0] < 0.01
+    assert named.sd[0] < max(0.01, abs(fraction) / 100)  # or a background has changed too
 
 
 def test_iron_of_another_permeability(session, generator):

@@ -18,11 +18,12 @@ from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import row_order_note, sensor_positions
-from halbach_fe.measurement.positions import follows_times, goes_both_ways, motion
+from halbach_fe.measurement.positions import follows_times, motion
 from halbach_fe.report.diagnosis import page as page_of_diagnosis
 from halbach_fe.report.inference import page as page_of_update
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
+from studies.diagnosis.drawn_studies import goes_both_ways
 from tests.support.short_dipole import BODY, NOISE_T, TEXT, truth
 
 LAG_M = 1e-4
@@ -67,13 +68,18 @@ def test_a_lag_is_named(session, generator):
     assert found.before.prior_conflict > found.before.conflict_limit
 
 
-def test_lines_of_one_direction_show_no_lag(session, generator):
-    """The same lag is then a shift of the map, and is not offered."""
-    assert Campaign.of(STUDY, map_of(SERPENTINE, 0.0, generator)).places(LAG, STUDY)
-    data = map_of(BODY, LAG_M, generator)
-    assert Campaign.of(STUDY, data).places(LAG, STUDY) == []
-    found = diagnose(STUDY, data, session, effects=SOME)
-    assert not any(one.hypothesis.effect.name == "lag" for one in found.identified)
+def test_a_lag_in_lines_of_one_direction(session, generator):
+    """It is a shift of all readings but the first of each line, where the stage is at rest."""
+    found = diagnose(STUDY, map_of(BODY, LAG_M, generator), session, effects=SOME)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["lag"]
+    assert found.unknown is None
+    lag = found.identified[0]
+    assert lag.values == pytest.approx([LAG_M], abs=4 * lag.sd[0])
+    # control: a map that is displaced has no lag
+    moved = map_of(BODY, 0.0, generator)
+    moved = moved.assign_coords(z_m=moved["z_m"] + LAG_M)
+    found = diagnose(STUDY, moved, session, effects=SOME)
+    assert [one.selection.effects for one in found.identified] == [("mapper_translation",)]
 
 
 def test_the_way_of_a_stage():
@@ -86,7 +92,6 @@ def test_the_way_of_a_stage():
     np.testing.assert_allclose(
         sensor_positions(Instrument(lag_m=0.05), points)[:, 0], points - 0.05 * way)
     assert not motion(np.zeros((3, 3))).any()
-    assert not goes_both_ways(points[:1])
     twice = np.repeat(points, 2, axis=0)  # every point is read twice
     np.testing.assert_array_equal(motion(twice), np.repeat(way, 2, axis=0))
     line = np.array([[0.0, 0, z] for z in (0, 1, 2, 4, 5, 6, 10, 14, 15)])  # steps of many lengths
@@ -130,7 +135,7 @@ def circles(angles, radii, heights, to_and_fro):
 @pytest.mark.parametrize(("angles", "radii", "heights"), [
     (24, (1.0,), (0.0, 0.2)), (7, (0.015,), (0.0, 0.02, 0.04)), (8, (0.015,), (0.0, 0.02)),
     (24, (5.0, 10.0, 30.0), (0.0, 1.0))])
-def test_circles_in_one_sense_show_no_lag(angles, radii, heights):
+def test_circles_in_one_sense(angles, radii, heights):
     one_sense = circles(angles, radii, heights, False)
     assert not goes_both_ways(one_sense)
     assert goes_both_ways(circles(angles, radii, heights, True))
@@ -139,7 +144,7 @@ def test_circles_in_one_sense_show_no_lag(angles, radii, heights):
 
 
 @pytest.mark.parametrize("apart", [0.3, 1.0, 10.0])
-def test_lines_far_apart_show_a_lag_too(apart):
+def test_lines_to_and_fro(apart):
     lines = np.array([[[x, 0.0, z] for z in np.arange(30.0)] for x in apart * np.arange(5)])
     assert not goes_both_ways(lines.reshape(-1, 3))
     lines[1::2] = lines[1::2, ::-1]

@@ -190,12 +190,6 @@ class Effect(ABC):
         """Return the places where the effect can occur; none if the study rules it out."""
         return [Place()]
 
-    def can_show(self, points: Floats) -> bool:
-        """Tell whether the effect differs from simpler ones in a map of points (n, 3), which are in
-        the order of the scan, in m and along the magnet's axes; by default it does.
-        """
-        return True
-
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
     ) -> Sequence[Place]:

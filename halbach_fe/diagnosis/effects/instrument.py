@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place
-from halbach_fe.measurement.positions import goes_both_ways
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -37,10 +35,6 @@ class InstrumentRow(InstrumentEffect):
     change_of: Change
     is_divisible: bool = True
     of_total_field: bool = False
-    shown_by: Callable[[Floats], bool] = lambda points: True
-
-    def can_show(self, points: Floats) -> bool:
-        return self.shown_by(points)
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         return self.change_of(instrument, values)
@@ -138,9 +132,8 @@ EFFECTS = (
          _plus("radius_scale")),
     # towards -y, with the square of the distance from the end at the smallest z
     _row("arm_sag", "sag of the mapper's arm", "sag", "m", 5e-4, _plus("arm_sag_m")),
-    # in lines that all go one way a lag is a shift of the map
-    _row("lag", "lag of the readings behind the stage", "distance", "m", 3e-4, _plus("lag_m"),
-         shown_by=goes_both_ways),
+    # in lines that all go one way it is a shift of the map but for the first point of each
+    _row("lag", "lag of the readings behind the stage", "distance", "m", 3e-4, _plus("lag_m")),
     _row("drift", "drift of the zeros during the scan", "x y z", "T", 1e-4, _plus("drift_T")),
     # a magnet of NdFeB that gets warmer by a degree has lost a part in a thousand
     _row("gain_drift", "drift of the readings in proportion to the field, as of a warming magnet",

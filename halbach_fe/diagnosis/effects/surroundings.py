@@ -25,7 +25,6 @@ class BackgroundEffect(Effect):
 
     name = "background"
     title = "uniform background field"
-    is_divisible = False
     parameters = (
         Parameter("x", "T", 0.0001), Parameter("y", "T", 0.0001), Parameter("z", "T", 0.0001),)
 
