@@ -539,10 +539,10 @@ def default_region(magnet: Magnet) -> Region:
 
 
 def default_centre(magnet: Magnet) -> tuple[float, float, float]:
-    """Return the centre in m of the study's region, or the middle of the magnet on the z axis."""
+    """Return the centre in m of the study's region, or the middle of the magnet."""
     asked = magnet.study.homogeneity
     stated = None if asked is None else asked.centre_m
-    return stated or (0.0, 0.0, magnet.middle_z_m)
+    return stated or magnet.middle_m
 
 
 Distance = Callable[[Floats], Floats]
