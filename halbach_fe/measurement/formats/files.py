@@ -22,7 +22,7 @@ from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
     TO_METRES,
-    check_readings,
+    checked_readings,
     doubt_of_metres,
     labelled_map,
     read_map,
@@ -100,11 +100,10 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     if declared.positions is not None:
         table = with_positions(table, declared.positions, declared.length_unit)
     found = to_map(table, declared)
-    data = found.data
-    check_readings(data, path)
+    data = checked_readings(found.data, path)
     data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
                    "imported_sha256": hashlib.sha256(raw).hexdigest()}
-    return _with_doubt(replace(found, format=name), declared)
+    return _with_doubt(replace(found, data=data, format=name), declared)
 
 
 def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
