@@ -692,7 +692,7 @@ def checked_readings(data: xr.Dataset, path: Path | str) -> xr.Dataset:
 def without_reading(blank: NDArray[np.bool_], where: str) -> str:
     """Say how many rows of a map, those of ``blank`` (n,), are left out as nothing was read."""
     return (f"Left out: {int(blank.sum())} of {len(blank)} rows of {where}, in which nothing was "
-            f"read; the first is row {int(np.argmax(blank)) + 1}.")
+            f"read; the first is row {int(np.argmax(blank)) + 1}. Rows are counted without them.")
 
 
 def _no_noise(name: str, where: str, sigma: Floats, read: NDArray[np.bool_]) -> MeasurementError:
