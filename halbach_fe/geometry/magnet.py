@@ -263,13 +263,23 @@ class Magnet(ShownInNotebook):
 
     @property
     def field_reach(self) -> float:
-        """Distance in m from the middle up to which there is some field; of a 3D magnet."""
+        """Distance in m from the origin up to which there is some field; of a 3D magnet."""
         # distance by which the field is summed beyond the ends, relative to the magnet's outer
         # radius, of what permeability and iron add: `halbach_fe.response.multipoles`. It falls as
         # 1/z^3, so that about 1e-3 of its integral of order 1 lies beyond. The distance is half of
         # that to the boundary of 3D meshes.
         reach_per_radius = 4.5
         return self.half_length + reach_per_radius * self.radius
+
+    def refuse_without_field(self, what: str, distance_m: float, given: str) -> None:
+        """Raise StudyError if what reaches ``distance_m`` from the origin has hardly any field."""
+        if distance_m > self.field_reach:
+            in_mm = look_like_mm(np.array([[distance_m, 0.0, 0.0]]),
+                                 max(self.radius, self.half_length))[0]
+            raise StudyError(must_be(
+                what, f"study {self.name}", f"within {self.field_reach:.3g} m of the origin, where "
+                "there is some field of the magnet", given, "Was it meant in millimetres?" if in_mm
+                else "Stay nearer to the magnet."))
 
     @cached_property
     def middle_z_m(self) -> float:

@@ -507,6 +507,7 @@ def test_error_bars_have_that_of_the_solver(tmp_path):
     (["--centre-m", "0", "0", "1"], "must be beside a region"),
     (["--sphere-m", "0.005", "--centre-m", "0", "0", "10"], "where there is some field"),
     (["--cylinder-m", "0.005", "19"], "where there is some field"),
+    (["--sphere-m", "0.3", "--centre-m", "0", "0", "0.3"], "m. Stay nearer to the magnet."),
     (["--cylinder-m", "0.005", "100"], "Was it meant in millimetres?"),
 ])
 def test_bad_regions(tmp_path, capsys, options, sentence):
