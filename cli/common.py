@@ -262,11 +262,11 @@ def region_of(arguments: argparse.Namespace, magnet: hf.Magnet) -> hf.Region | N
 
 
 def blocks_and_held_out(
-    arguments: argparse.Namespace,
+    arguments: argparse.Namespace, study: hf.Study
 ) -> tuple[hf.BlockTable | None, xr.Dataset | None]:
     """Read the block table and the held-out map; None stands for a file not given."""
     return (blocks_of(arguments.blocks),
-            read_one(arguments, arguments.held_out) if arguments.held_out else None)
+            read_one(arguments, arguments.held_out, study) if arguments.held_out else None)
 
 
 def blocks_of(path: Path | None) -> hf.BlockTable | None:
@@ -305,10 +305,22 @@ def read_measurements(
                 "maps", "given", "State maps.instrument.length_unit_m and flux_density_unit_T in "
                 "the study, or convert its maps by halbach-fe import-map."))
         return different_maps(study, _listed(arguments, study))
-    return read_one(arguments, arguments.measurements)
+    return read_one(arguments, arguments.measurements, study)
 
 
-def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
+def read_one(
+    arguments: argparse.Namespace, path: Path, study: hf.Study | None = None
+) -> xr.Dataset:
+    """Read a map, of a magnet's study if there is one, and refuse units that both state."""
+    from halbach_fe.measurement.formats.files import refuse_units_twice
+
+    data = _read_one(arguments, path)
+    if study is not None:
+        refuse_units_twice(data, study.instrument, path)
+    return data
+
+
+def _read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     """Read a map in halbach-fe's own columns, as the options of `import-map` describe it, or as
     the file itself says.
     """

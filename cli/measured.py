@@ -305,7 +305,7 @@ def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
     study = magnet.study
     data = common.read_measurements(arguments, study)
-    blocks, validation_map = common.blocks_and_held_out(arguments)
+    blocks, validation_map = common.blocks_and_held_out(arguments, study)
     if arguments.samples and not magnet.is_nonlinear:
         raise StudyError(
             f"Input --samples must go with iron that has an H(B) curve; study {magnet.name} is "
@@ -393,7 +393,7 @@ def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
     study = magnet.study
     data = common.read_measurements(arguments, study)
-    blocks, validation_map = common.blocks_and_held_out(arguments)
+    blocks, validation_map = common.blocks_and_held_out(arguments, study)
     floor = floors_of(arguments.check, data)
     if arguments.dry_run:
         from halbach_fe.diagnosis.cost import estimate_diagnosis

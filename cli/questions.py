@@ -189,8 +189,8 @@ def homogeneity(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
         raise CommandLineError(must_be(
             "--degrees", "the command line", "of a sphere, which alone has spherical harmonics",
             "beside another region", "Leave it out, or give --sphere-m."))
-    data = (common.read_one(arguments, arguments.measurements) if arguments.measurements
-            else None)
+    data = (common.read_one(arguments, arguments.measurements, magnet.study)
+            if arguments.measurements else None)
     with common.session(arguments, magnet.study) as session:
         return hf.homogeneity(magnet, session, within_it, posterior,
                               arguments.degrees or SHOWN_DEGREES, data)
@@ -369,7 +369,7 @@ def shim(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
                          "replaced; instead --replace is missing. Add --replace.")
     check_shimming(magnet.study)
     refuse_several_maps(magnet.study, "shim")
-    data = common.read_one(arguments, arguments.measurements)
+    data = common.read_one(arguments, arguments.measurements, magnet.study)
     blocks, stock = map(common.blocks_of, (arguments.blocks, arguments.stock))
     # refuse before the solves, which may take long, what does not fit the study
     check_objective(magnet, common.reference(arguments), arguments.limit_units,

@@ -495,6 +495,6 @@ def write_template(path: Path, template: MagnetTemplate) -> tuple[Magnet, Magnet
     """Write a new study file; return its magnet, and the template with the noise of its study."""
     magnet, template = new_magnet(template, path.stem, path.parent)
     if template.dsv_m is not None:  # refuses one that is not in air
-        region_points(magnet, Region.sphere(template.dsv_m / 2, (0.0, 0.0, magnet.middle_z_m)))
+        region_points(magnet, Region.sphere(template.dsv_m / 2, magnet.middle_m))
     write_new_study(path, template)
     return magnet, template

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, box_middle
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
@@ -269,12 +269,10 @@ def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Fl
             f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
             f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
             "fewer, or add `plan.candidates`.")
-    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
-    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
-        raise StudyError(must_be(
-            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
-            "the magnet, where there is some field", f"one at {farthest:.4g} m",
-            "Are they in metres?"))
+    if magnet.study.plan.candidates and magnet.dimension == 3:
+        farthest = candidates[np.argmax(np.linalg.norm(candidates, axis=1))]
+        magnet.refuse_without_field("`plan.candidates`", float(np.linalg.norm(farthest)),
+                                    f"one at ({', '.join(f'{each:g}' for each in farthest)}) m")
     check_points(magnet, baseline)
     check_points(magnet, candidates, "plan.candidates")
     if magnet.study.homogeneity is not None:

@@ -300,10 +300,10 @@ def vector(values: Floats) -> tuple[float, float, float]:
     return x, y, z
 
 
-def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
-    """Return the radius in m of the largest cylinder about the z axis that nominal blocks leave
-    free, by points on their outlines, at least 1e-4 m. If a block covers the axis, it is how far
-    the block's outline is from it.
+def bore_radius(blocks: Sequence[MagnetBlock], axis_m: Floats) -> float:
+    """Return the radius in m of the largest cylinder along z about an axis at x and y in m that
+    nominal blocks leave free, by points on their outlines, at least 1e-4 m. If a block covers the
+    axis, it is how far the block's outline is from it.
     """
     smallest = np.inf
     for block in blocks:
@@ -312,7 +312,7 @@ def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
             heights = [0.0] if np.isinf(block.z_max) else np.linspace(block.z_min, block.z_max, 9)
             nominal = rotation_matrix(block.orientation_rad)
             outline = (at_heights(outline, *heights) @ nominal.T + block.origin_m)[:, :2]
-        smallest = min(smallest, float(np.hypot(*outline.T).min()))
+        smallest = min(smallest, float(np.hypot(*(outline - axis_m).T).min()))
     return max(smallest, 1e-4)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Bools, Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, box_middle, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
@@ -263,13 +263,23 @@ class Magnet(ShownInNotebook):
 
     @property
     def field_reach(self) -> float:
-        """Distance in m from the middle up to which there is some field; of a 3D magnet."""
+        """Distance in m from the origin up to which there is some field; of a 3D magnet."""
         # distance by which the field is summed beyond the ends, relative to the magnet's outer
         # radius, of what permeability and iron add: `halbach_fe.response.multipoles`. It falls as
         # 1/z^3, so that about 1e-3 of its integral of order 1 lies beyond. The distance is half of
         # that to the boundary of 3D meshes.
         reach_per_radius = 4.5
         return self.half_length + reach_per_radius * self.radius
+
+    def refuse_without_field(self, what: str, distance_m: float, given: str) -> None:
+        """Raise StudyError if what reaches ``distance_m`` from the origin has hardly any field."""
+        if distance_m > self.field_reach:
+            in_mm = look_like_mm(np.array([[distance_m, 0.0, 0.0]]),
+                                 max(self.radius, self.half_length))[0]
+            raise StudyError(must_be(
+                what, f"study {self.name}", f"within {self.field_reach:.3g} m of the origin, where "
+                "there is some field of the magnet", given, "Was it meant in millimetres?" if in_mm
+                else "Stay nearer to the magnet."))
 
     @cached_property
     def middle_z_m(self) -> float:
@@ -283,8 +293,20 @@ class Magnet(ShownInNotebook):
         return 0.0 if abs(low + high) / 2 < rounding * (high - low) else (low + high) / 2
 
     @cached_property
+    def middle_m(self) -> tuple[float, float, float]:
+        """Middle of the magnet in m: on the z axis, unless blocks are around another axis and that
+        one lies beside them all.
+        """
+        places = np.array([block.middle[:2] for block in self.blocks])
+        x, y = middle = box_middle(places)
+        is_beside = np.hypot(*middle) > radii_of(places - middle).max()
+        if is_beside and self._is_around(x, y):
+            return float(x), float(y), self.middle_z_m
+        return 0.0, 0.0, self.middle_z_m
+
+    @cached_property
     def bore_radius(self) -> float:
-        """Radius in m of the largest cylinder about the z axis that the blocks leave free.
+        """Radius in m of the largest cylinder along z about `middle_m` that the blocks leave free.
 
         For equal rings it is their inner radius, which corners of turned cuboids may pass. Of a
         magnet without a bore it is a length scale only, see `has_bore`.
@@ -294,16 +316,21 @@ class Magnet(ShownInNotebook):
     @cached_property
     def free_radius(self) -> float:
         """The same by the corners of turned cuboids too."""
-        return bore_radius(self.blocks)
+        return bore_radius(self.blocks, np.array(self.middle_m[:2]))
 
     @cached_property
     def has_bore(self) -> bool:
         """Whether the z axis is free, with blocks around it and not on one side only."""
-        angles = np.sort([np.arctan2(*block.middle[1::-1]) for block in self.blocks])
+        return self._is_around(0.0, 0.0)
+
+    def _is_around(self, x: float, y: float) -> bool:
+        """Tell whether a line along z is free, with blocks around it and not on one side only."""
+        angles = np.sort([np.arctan2(block.middle[1] - y, block.middle[0] - x)
+                          for block in self.blocks])
         widest = np.diff(angles, append=angles[0] + 2 * np.pi).max()
         reach = 0.0 if self.dimension == 2 else self.half_length
         z = np.linspace(-reach, reach, 33)
-        axis = np.column_stack([0 * z, 0 * z, z])
+        axis = np.column_stack([x + 0 * z, y + 0 * z, z])
         # angle in rad beyond half a turn without blocks about the axis, from which blocks are on
         # one side. Two opposite poles leave half a turn, but for the rounding of their tables to
         # micrometres.

@@ -296,9 +296,9 @@ class PoseFit:
     def scaled(self, pose: Floats, values: Floats, start: Floats) -> Floats:
         """Return all parameters (p,) less their prior means, in prior standard deviations.
 
-        The prior mean of the place across is the axis, that of the place along it is the one of
-        the pose ``start``; of the turns it is the nearest rotation by right angles. On a known
-        stage all of them are those of ``start``.
+        The prior mean of the place across is the magnet's axis, that of the place along it is the
+        one of the pose ``start``; of the turns it is the nearest rotation by right angles. On a
+        known stage all of them are those of ``start``.
         """
         if self.on_known_stage:
             turned = (Rotation.from_rotvec(pose[3:])
@@ -309,7 +309,7 @@ class PoseFit:
         nearest = min(turns, key=lambda turn: (
             Rotation.from_rotvec(start[3:]) * turn.inv()).magnitude())
         turned = (Rotation.from_rotvec(pose[3:]) * nearest.inv()).as_rotvec()
-        place = pose[:3] - [0.0, 0.0, start[2]]
+        place = pose[:3] - [*self.magnet.middle_m[:2], start[2]]
         return np.concatenate([np.append(place, turned) / self.pose_sd, values / self.prior_sd()])
 
     def _study_to_update(self, pose: Floats, values: Floats, pose_sd: Floats) -> Study:

@@ -227,9 +227,10 @@ def _chosen(training: NDArray[np.bool_], count: int) -> Ints:
 def _scores(
     magnet: Magnet, vacuum: Shown, points: Floats, used: Floats, training: NDArray[np.bool_],
     rotations: Sequence[Floats], pace: Pace,
-) -> list[tuple[float, float, Floats]]:
-    """Return misfits in T of places on the axis in m, and of rotations, the best first."""
+) -> list[tuple[float, Floats, Floats]]:
+    """Return misfits in T of places (3,) on the axis in m, and of rotations, the best first."""
     rows, few = np.flatnonzero(training.any(axis=1)), _chosen(training, COARSE_POINTS)
+    axis = np.array([*magnet.middle_m[:2], 0.0])
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
     scores = []
@@ -237,8 +238,8 @@ def _scores(
     for number, matrix in enumerate(rotations):
         pace.advance(number, len(rotations))
         turned = points[few] @ matrix.T
-        shifts = np.linspace(-reach, reach, steps)
-        places = turned[None] + np.outer(shifts, [0, 0, 1])[:, None]
+        shifts = np.linspace(-reach, reach, steps)[:, None] * [0, 0, 1] + axis
+        places = turned[None] + shifts[:, None]
         inside = magnet.contains(places.reshape(-1, 3)).reshape(len(shifts), -1).any(axis=1)
         shifts, places = shifts[~inside], places[~inside]
         if not len(shifts):
@@ -246,38 +247,38 @@ def _scores(
         fields = vacuum(places.reshape(-1, 3)).reshape(len(shifts), -1, 3)
         fields = vacuum.along(fields, matrix)
         scores += [(misfit_of(field, used[few], training[few])[0], shift, matrix)
-                   for shift, field in zip(shifts.tolist(), fields, strict=True)]
+                   for shift, field in zip(shifts, fields, strict=True)]
     return sorted(scores, key=lambda each: each[0])
 
 
 def _worth_trying(
-    scores: Sequence[tuple[float, float, Floats]], known: float
-) -> list[tuple[float, Floats]]:
+    scores: Sequence[tuple[float, Floats, Floats]], known: float
+) -> list[tuple[Floats, Floats]]:
     """Return places and rotations that are improved, of scores with the best first.
 
     ``known`` is the misfit in T of the best pose that is known already.
     """
     tried: dict[bytes, int] = {}
     found = []
-    for rough, shift, matrix in scores:
+    for rough, place, matrix in scores:
         key = matrix.tobytes()
         tried[key] = tried.get(key, 0) + 1
         if rough <= WORTH_TRYING * min(scores[0][0], known) and tried[key] <= CANDIDATES:
-            found.append((shift, matrix))
+            found.append((place, matrix))
     return found
 
 
 def _all_improved(
     magnet: Magnet, vacuum: Shown, points: Floats, used: Floats, training: NDArray[np.bool_],
-    worth: Sequence[tuple[float, Floats]], pace: Pace,
+    worth: Sequence[tuple[Floats, Floats]], pace: Pace,
 ) -> list[tuple[float, Floats]]:
     """Return misfits in T and different poses (6,) to which least squares leads from some."""
     more = _chosen(training, MIDDLE_POINTS)
     improved: list[tuple[float, Floats]] = []
     pace.begin("search of the pose, candidates improved")
-    for number, (shift, matrix) in enumerate(worth):
+    for number, (place, matrix) in enumerate(worth):
         pace.advance(number, len(worth))
-        pose = np.concatenate([[0.0, 0.0, shift], Rotation.from_matrix(matrix).as_rotvec()])
+        pose = np.concatenate([place, Rotation.from_matrix(matrix).as_rotvec()])
         misfit, pose = _improved(magnet, vacuum, pose, points[more], used[more], training[more])
         if misfit is not None and not any(same_pose(pose, other) for _, other in improved):
             improved.append((misfit, pose))
@@ -452,7 +453,7 @@ def _transverse_starts(magnet: Magnet, across_m: float) -> Floats:
     starts = np.concatenate([radius * magnet.bore_radius * (ring if radius else ring[:1])
                              for radius in RADII])
     allowed = np.hypot(*starts.T) <= 3 * across_m
-    return np.asarray(starts[allowed])
+    return np.asarray(starts[allowed] + magnet.middle_m[:2])
 
 
 def _improved_line(
@@ -463,9 +464,10 @@ def _improved_line(
     stretch_sd = 0.05  # prior standard deviation of the scale of the positions
     size = float(np.sqrt(np.sum(used**2) / seen.sum()))
     scales = np.array([magnet.bore_radius] * 3 + [1.0])
+    axis = np.array([*magnet.middle_m[:2], 0.0])
 
     def places(parameters: Floats) -> Floats:
-        return points @ matrix.T * (1 + parameters[3]) + parameters[:3]
+        return points @ matrix.T * (1 + parameters[3]) + parameters[:3] + axis
 
     known: dict[bytes, Floats] = {}
 
@@ -491,12 +493,13 @@ def _improved_line(
             known[(scaled + step).tobytes()] = field
         return np.column_stack([(residual(scaled + step) - now) / DIFFERENCE for step in steps])
 
-    start = np.append(place, 0.0) / scales
+    start = np.append(place - axis, 0.0) / scales
     bound = 0.97 * magnet.bore_radius / np.sqrt(2) / scales[0]
     low = np.array([-bound, -bound, -np.inf, -4 * stretch_sd])
     found = least_squares(residual, start, derivative, bounds=(low, -low), max_nfev=MOST_STEPS)
     parameters = found.x * scales
-    pose = np.concatenate([parameters[:3], Rotation.from_matrix(matrix).as_rotvec()])
+    pose = np.concatenate([
+        parameters[:3] + axis, Rotation.from_matrix(matrix).as_rotvec()])
     if magnet.contains(places(parameters)).any():
         return None, pose
     return misfit_of(

@@ -26,6 +26,7 @@ from halbach_fe.measurement.field_map import (
     points_of,
     read_map,
 )
+from halbach_fe.measurement.formats.files import refuse_units_twice
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
 from halbach_fe.measurement.positions import follows_times
@@ -125,6 +126,8 @@ def read_maps(study: Study, folder: str | Path = ".") -> dict[str, xr.Dataset]:
 def different_maps(study: Study, files: Mapping[str, Path]) -> dict[str, xr.Dataset]:
     """Read the files of a study's maps, by name, as `read_maps` does."""
     found = {name: read_map(file) for name, file in files.items()}
+    for number, (name, data) in enumerate(found.items()):
+        refuse_units_twice(data, study.of_map(number).instrument, files[name])
     if found:
         maps_of(study, found)
     return found

@@ -388,7 +388,8 @@ def read_map(path: str | Path) -> xr.Dataset:
 
     In CSV, comments ``# key: value`` are attributes. The header names, in any order, the columns
     x_m, y_m, z_m, at least one of Bx_T, By_T, Bz_T or Babs_T (|B|), and optionally sigma_T (or
-    sigma_Bx_T ...), time_s and scan. An empty field is a component that was not measured.
+    sigma_Bx_T ...), time_s and scan. An empty field, or nan, is a component that was not measured;
+    of rows without any a warning says how many are left out.
 
     Parameters
     ----------
@@ -420,7 +421,7 @@ def read_map(path: str | Path) -> xr.Dataset:
         data = _read_hdf5(path)
     else:
         data = _read_vtu(raw, path) if path.suffix == ".vtu" else _read_csv(raw, path)
-    check_readings(data, path)
+    data = checked_readings(data, path)
     data.encoding["source"] = str(path)
     return data
 
@@ -494,9 +495,7 @@ def checked_map(data: object, name: str) -> xr.Dataset:
             "data", f"map {name}", "a Dataset", f"a {type(data).__name__}",
             "Read the file by read_map, and the maps that a study lists by read_maps."))
     name = str(data.encoding.get("source", name))
-    data = labelled_map(data, f"map {name}")
-    check_readings(data, name)
-    return data
+    return checked_readings(labelled_map(data, f"map {name}"), name)
 
 
 def labelled_map(data: xr.Dataset, where: str) -> xr.Dataset:
@@ -642,7 +641,7 @@ def _check_header(header: list[str], where: str) -> None:
 
 def _number(cell: str, name: str, number: int, where: str) -> float:
     may_be_empty = name in (*FIELD_COLUMNS, *SIGMA_COLUMNS, *TOTAL_COLUMNS)
-    if not cell and may_be_empty:
+    if may_be_empty and cell.lower() in ("", "nan"):
         return np.nan
     return finite(cell, f"{name} in line {number}", where,
                   "Write seconds, or call the column time and convert the file by halbach-fe "
@@ -650,8 +649,10 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
                   if may_be_empty else "Correct it, or remove the row.")
 
 
-def check_readings(data: xr.Dataset, path: Path | str) -> None:
-    """Check points and values of a map; raise MeasurementError for the first invalid reading."""
+def checked_readings(data: xr.Dataset, path: Path | str) -> xr.Dataset:
+    """Return a map without its rows that hold no reading, of which it warns; raise
+    MeasurementError for the first invalid point or value.
+    """
     where = f"map {path}"
     if not data.sizes["point"]:
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
@@ -663,9 +664,13 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     blank = np.isnan(values).all(axis=1)
     if TOTAL_COLUMN in data:
         blank = _without_total(data, blank, where)
+    if blank.all():
+        raise MeasurementError(must_be("content", where, "at least one reading",
+                                       f"{len(blank)} rows without a number of the field"))
     if blank.any():
-        raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
-                                       "at least one component", "none", "Remove the line."))
+        warnings.warn(without_reading(blank, where), HalbachWarning, stacklevel=3)
+        data, values = data.isel(point=~blank), values[~blank]
+        points = points[~blank]
     if "sigma_T" in data:
         sigma = data["sigma_T"].values[~np.isnan(values)]
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
@@ -681,6 +686,13 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     if "scan" in data:
         _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)
+    return data
+
+
+def without_reading(blank: NDArray[np.bool_], where: str) -> str:
+    """Say how many rows of a map, those of ``blank`` (n,), are left out as nothing was read."""
+    return (f"Left out: {int(blank.sum())} of {len(blank)} rows of {where}, in which nothing was "
+            f"read; the first is row {int(np.argmax(blank)) + 1}. Rows are counted without them.")
 
 
 def _no_noise(name: str, where: str, sigma: Floats, read: NDArray[np.bool_]) -> MeasurementError:

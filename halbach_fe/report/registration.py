@@ -351,8 +351,10 @@ def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
     turn = turn_of(instrument).as_matrix()
     scale = 1 + np.array([instrument.radius_scale, instrument.radius_scale, instrument.z_scale])
     sensor = np.mean(instrument.sensor_position_m, axis=0)
-    centre = (-turn.T @ instrument.translation_m - sensor) / scale
-    sd = np.hypot(best.translation_sd_m, moved_by_turns(best.middle_m, best.rotation_sd_rad))
+    middle = np.array(build_magnet(best.study).middle_m)
+    centre = (turn.T @ (middle - instrument.translation_m) - sensor) / scale
+    sd = np.hypot(
+        best.translation_sd_m, moved_by_turns(best.middle_m - middle, best.rotation_sd_rad))
     axes = np.array([COMPONENTS.index(axis[-1]) for axis in instrument.position_axes])
     signs = np.array([-1.0 if axis.startswith("-") else 1.0 for axis in instrument.position_axes])
     return signs * centre[axes], np.sqrt(turn.T**2 @ sd**2 / scale**2)[axes]

@@ -108,7 +108,7 @@ def magnetic_axis(
     """
     magnetizations = distribution_of(magnet, magnetizations, "magnetizations").stacked
     flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius
-    radius, middle = RADIUS * bore, np.array([0.0, 0.0, magnet.middle_z_m])
+    radius, middle = RADIUS * bore, np.array(magnet.middle_m)
     reach = 0.0 if flat else LENGTH * (magnet.array_half_length - abs(middle[2]))
     heights = np.zeros(1) if flat else np.linspace(-reach, reach, HEIGHTS)  # from the middle
     count = 2 * (order + 2)
@@ -118,7 +118,8 @@ def magnetic_axis(
     # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
     sphere = bore / 4 * _ON_SPHERE
     points = middle + (np.vstack([around, sphere]) if order == 1 and not flat else around)
-    if magnet.contains(points).any() or _has_source(magnet, bore / 4, middle[2] + heights):
+    if magnet.contains(points).any() or _has_source(
+            magnet, bore / 4, middle + heights[:, None] * [0, 0, 1.0]):
         return None  # something stands in the bore
     size = magnet.dimension
     field, nominal, columns = (
@@ -149,7 +150,7 @@ def magnetic_axis(
         return MagneticAxis(order, roll, roll_sd, *centre)
     below, below_root = multipole(order - 1, field), multipole(order - 1, columns)
     scale = -radius / (order - 1)
-    places = scale * below / main  # x0 + i y0 at each height
+    places = middle[:2] @ [1, 1j] + scale * below / main  # x0 + i y0 at each height
     place_rows = scale * (below_root - (below / main)[:, None] * root) / main[:, None]
     design = np.column_stack([np.ones_like(heights), heights])[:, :1 if flat else 2]
     fit = np.linalg.pinv(design)
@@ -163,10 +164,10 @@ def magnetic_axis(
     return MagneticAxis(order, roll, roll_sd, *both(0), *(() if flat else both(1)))
 
 
-def _has_source(magnet: Magnet, radius: float, heights: Floats) -> bool:
-    """Return whether a coil or dipole is within a radius in m of the axis along heights in m."""
-    axis = np.zeros((1 + 2 * int(np.ceil(np.ptp(heights) / radius)), 3))
-    axis[:, 2] = np.linspace(heights[0], heights[-1], len(axis))
+def _has_source(magnet: Magnet, radius: float, line: Floats) -> bool:
+    """Return whether a coil or dipole is within a radius in m of a line of places (n, 3) in m."""
+    count = 1 + 2 * int(np.ceil(np.ptp(line[:, 2]) / radius))
+    axis = np.linspace(line[0], line[-1], count)
     return any((distance_in_magnet(coil, axis) < radius).any()
                for coil in magnet.external.coils) or any(
         (np.linalg.norm(axis - one.position_m, axis=1) < radius).any()

@@ -413,11 +413,8 @@ def unwanted_orders(
     if magnet.dimension == 2 and reference.z_m is not None:
         raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
                                  f"{reference.z_m:g}"))
-    if reference.z_m is not None and abs(reference.z_m) > (reach := magnet.field_reach):
-        raise StudyError(must_be(
-            "--at-z-m", f"study {magnet.name}",
-            f"from {-reach:.3g} to {reach:.3g} m, where there is some field",
-            f"{reference.z_m:g}", "Was it meant in millimetres?"))
+    if reference.z_m is not None:
+        magnet.refuse_without_field("--at-z-m", abs(reference.z_m), f"{reference.z_m:g}")
     return orders, _radius(magnet, reference)
 
 

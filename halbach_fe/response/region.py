@@ -363,11 +363,8 @@ def region_points(
     if min(region.half_axes_m) < smallest_m:
         raise StudyError(must_be("the region", f"study {magnet.name}",
                                  f"of at least {smallest_m:g} m in all directions", region.text))
-    far = magnet.field_reach
-    if np.abs(region.centre_m).max() + max(region.half_axes_m) > far:
-        raise StudyError(must_be("the region", f"study {magnet.name}",
-                                 f"within {far:.3g} m of the middle of the magnet, where there is "
-                                 "some field", region.text, "Was it meant in millimetres?"))
+    magnet.refuse_without_field("the region", float(np.abs(region.centre_m).max()) + max(
+        region.half_axes_m), region.text)
     middles = np.array([block.middle for block in magnet.blocks])
     if region.contains(middles).any():  # the points below may miss blocks in a large region
         raise StudyError(must_be("the region", f"study {magnet.name}", "in air",
@@ -539,10 +536,10 @@ def default_region(magnet: Magnet) -> Region:
 
 
 def default_centre(magnet: Magnet) -> tuple[float, float, float]:
-    """Return the centre in m of the study's region, or the middle of the magnet on the z axis."""
+    """Return the centre in m of the study's region, or the middle of the magnet."""
     asked = magnet.study.homogeneity
     stated = None if asked is None else asked.centre_m
-    return stated or (0.0, 0.0, magnet.middle_z_m)
+    return stated or magnet.middle_m
 
 
 Distance = Callable[[Floats], Floats]

@@ -193,7 +193,12 @@ def test_temperatures_in_kelvin(campaign, tmp_path, capsys, celsius):
 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"plan__candidates": [{"kind": "points", "points_m": [[0.0, 0.0, 20.0], [0.0, 0.0, 0.0],
-                                                           [0.0, 0.0, 0.01]]}]}, "Are they in met"),
+                                                           [0.0, 0.0, 0.01]]}]},
+     "within 0.392 m of the origin, where there is some field of the magnet; instead received one "
+     "at (0, 0, 20) m. Was it meant in millimetres?"),
+    ({"plan__candidates": [{"kind": "points", "points_m": [[0.0, 0.0, 1.2], [0.0, 0.0, 0.0],
+                                                           [0.0, 0.0, 0.01]]}]},
+     "at (0, 0, 1.2) m. Stay nearer to the magnet."),  # plainly in m
     ({"demagnetization__remanence_coefficient_per_K": 1.2e-3}, "remanence_coefficient_per_K"),
     ({"demagnetization__coercivity_coefficient_per_K": 3e-3}, "that of ferrite alone")])
 def test_studies_in_other_units_or_of_another_sign(tmp_path, capsys, changes, said):

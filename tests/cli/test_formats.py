@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -63,6 +64,41 @@ def test_refusals(tmp_path, capsys):
                               tmp_path / "map.dat"], capsys)
     assert (code, 'kind = "grid"' in sentence) == (4, True)
     assert not (tmp_path / "map.dat").exists()
+
+
+HEADERS = {"states": "x [mm],y [mm],z [mm],Bx [mT]\n", "silent": "x,y,z,Bx\n",
+           "own": "x_m,y_m,z_m,Bx_T\n"}
+UNITS = ["--length-unit", "mm", "--field-unit", "mT"]
+
+
+@pytest.mark.parametrize(("header", "key", "options", "twice"), [
+    ("states", "length_unit_m = 0.001", [], "left out for map .*hall.txt, .* from mm, .* 0.001, "),
+    ("states", "length_unit_m = 0.01", UNITS, "from mm, as its header or --length-unit .* 0.01, "),
+    ("states", "flux_density_unit_T = 0.001", [], "from mT, as its header or --field-unit says"),
+    ("silent", "length_unit_m = 0.001", UNITS, "from mm"),
+    ("imported", "length_unit_m = 0.001", [], "from mm"),
+    ("states", "length_unit_m = 1000.0", [], ""),  # a wrong header, as diagnose corrects it
+    ("own", "length_unit_m = 0.001", [], "")])
+@pytest.mark.parametrize("listed", [False, True])
+def test_units_are_not_converted_twice(tmp_path, capsys, header, key, options, twice, listed):
+    """A file that is read in m needs no unit of the study."""
+    text, hall, study = "".join(f"{n},0,0,{300 + n}\n" for n in range(9)), *(
+        tmp_path / name for name in ("hall.txt", "study.toml"))
+    hall.write_text(HEADERS.get(header, HEADERS["states"]) + text)
+    if header == "imported" or (listed and header != "own"):
+        assert main(["import-map", str(hall), "-o", str(tmp_path / "map.csv"), *options]) == 0
+        hall, options = tmp_path / "map.csv", []
+    assert main(["new", str(study)]) == 0
+    given = [] if listed else ["--measurements", hall, *options]
+    with study.open("a") as file:
+        file.write(f'\n[[maps]]\nname = "a"\nfile = "{hall.name}"\n[maps.instrument]\n{key}\n'
+                   if listed else f"\n[instrument]\n{key}\n")
+    capsys.readouterr()
+    code = main([*map(str, ["infer", study, *given, "-o", tmp_path / "out", "--dry-run"])])
+    sentence = capsys.readouterr().err
+    assert ("Remove the key" in sentence) == bool(twice)
+    assert re.search(twice.replace("hall.txt", hall.name), sentence)
+    assert not twice or (code, f"`instrument.{key.split()[0]}`" in sentence) == (3, True)
 
 
 @pytest.mark.parametrize("wrong", [

@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects import blocks, catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.linearization import amplitude_scale
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import mountings
 from halbach_fe.measurement.instrument import (
@@ -218,6 +219,31 @@ def test_effects_of_no_size_change_nothing(name):
     applied = effect.apply(study, place, [0.0] * len(effect.parameters))
     assert applied.iron == study.iron
     assert shown(applied) == pytest.approx(shown(study), abs=1e-15)
+
+
+def test_what_is_outside_the_magnet_lies_about_its_own_middle():
+    """Blocks of a table need not lie about z = 0, nor about the z axis."""
+    names = ("neighbour_magnet", "ferromagnetic_object", "iron_ring")
+    pair = STUDY.with_(array__rings=2, external={})
+
+    def moved(along_m, across_m=0.0):
+        table = blocks_table(build_magnet(pair))
+        table["z_m"] = [z + along_m for z in table["z_m"]]
+        table["x_m"] = [x + across_m for x in table["x_m"]]
+        return parse_study(changed(DIPOLE, dimension=3, array={"free_blocks": table}))
+
+    nominal, away = moved(0.0), moved(0.7)
+    for name in names:
+        here, there = (EFFECTS[name].places(study) for study in (nominal, away))
+        shift = [0.0, 0.0, 0.7] if name == "ferromagnetic_object" else [0.0]
+        assert here  # negative control: there is something to compare
+        assert np.array([place.at_m for place in there]) == pytest.approx(
+            np.array([place.at_m for place in here]) + shift)
+    ring = EFFECTS["iron_ring"]
+    iron, = build_magnet(ring.apply(away, ring.places(away)[0], [1.0])).iron
+    low, high = build_magnet(away).array_ends
+    assert (iron.z_min, iron.z_max) == pytest.approx((low, high))
+    assert ring.places(moved(0.0, 0.9)) == []  # a tube is about the z axis
 
 
 def test_places_are_in_the_magnet():

@@ -36,7 +36,7 @@ from halbach_fe.inference import mcmc, storage
 from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.storage import _stored_root, read_posterior
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, read_order, write_blocks
-from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
+from halbach_fe.measurement.field_map import checked_readings, field_map, read_map, write_map
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import READERS as FORMATS
@@ -194,9 +194,7 @@ def a_response() -> bytes:
 def unverified(module: ModuleType, read: Callable[[Path], Any]) -> Callable[[Path], Any]:
     """A reader that takes every checksum for right: who makes a hostile file can compute it."""
     def reading(path: Path) -> Any:
-        with (mock.patch.object(module, "read_hdf5", untrusted.read_dataset),
-              warnings.catch_warnings()):
-            warnings.simplefilter("ignore", HalbachWarning)
+        with mock.patch.object(module, "read_hdf5", untrusted.read_dataset):
             return read(path)
     return reading
 
@@ -294,7 +292,7 @@ def check_posterior(found) -> None:
 
 
 def check_map(data: xr.Dataset) -> None:
-    check_readings(data, Path("map"))
+    checked_readings(data, Path("map"))
     assert data["B_T"].dtype.kind == "f"
     for value in data.attrs.values():
         str(value)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.numbers import EMPTY_CELL
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import pose_fit
 from halbach_fe.inference.infer import infer
@@ -53,6 +54,24 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
+
+
+def test_a_magnet_beside_the_z_axis_is_found(magnet, generator, tmp_path):
+    """The search went along the z axis, where such a magnet has a weak field, and its answer was
+    that the map is of another magnet. Its middle on the stage was that of the study's origin.
+    """
+    away = np.array([0.3, -0.1, 0.2])
+    table = blocks_table(magnet)
+    table |= {name: [value + more for value in table[name]]
+              for name, more in zip(("x_m", "y_m", "z_m"), away, strict=True)}
+    beside = build_magnet(magnet.study.with_(array={"free_blocks": table}))
+    data = measured(truth(generator), generator, Rotation.identity(), -GRID.mean(axis=0))
+    found = register(beside, data, Session.open(tmp_path))[0]
+    assert found.explains
+    assert found.middle_m == pytest.approx(away, abs=4 * float(np.linalg.norm(
+        found.translation_sd_m)))
+    assert magnet_on_stage(found)[0] == pytest.approx(
+        GRID.mean(axis=0), abs=4 * float(np.linalg.norm(found.translation_sd_m)))
 
 
 @pytest.fixture(scope="module")

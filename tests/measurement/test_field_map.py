@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.api import export
-from halbach_fe.core.errors import MeasurementError, OutputError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
@@ -87,11 +87,11 @@ def test_columns_in_any_order_and_missing_components(tmp_path):
     ("x_m,y_m,z_m,Bx_T,Bx_T\n0,0,0,1,1\n", "repeated"),
     ("x_m,y_m,z_m,Bx_T,sigma_T,sigma_Bx_T\n0,0,0,1,1,1\n", "not both"),
     (HEADER + "0,0,0,1,1\n", "cut short"),
-    (HEADER + "0,0,0,nan,1,1\n", "Bx_T in line 2"),
+    (HEADER + "0,0,0,inf,1,1\n", "Bx_T in line 2"),
     (HEADER + "0,0,inf,1,1,1\n", "z_m in line 2"),
     (HEADER + "0,0,,1,1,1\n", "z_m in line 2"),
     (HEADER + "0,0,0,one,1,1\n", "'one'"),
-    (HEADER + "0,0,0,,,\n", "at least one component"),
+    (HEADER + "0,0,0,,,\n0,0,1,nan,,\n", "at least one reading; instead received 2 rows without"),
     (HEADER + "0,0,0,.1,.1,.1\n0,0,1,.1,.1,.1\n0,0,0,.1,.1,.1\n", "reading 3"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,0\n", "sigma"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,-1\n", "sigma"),
@@ -104,6 +104,28 @@ def test_bad_csv_is_refused_by_name(tmp_path, text, said):
         read_map(path)
     assert said in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("blank", [("", "", ""), ("nan", "NaN", "")])
+@pytest.mark.parametrize("suffix", [".csv", ".h5", "in Python"])
+def test_rows_that_the_mapper_missed_are_left_out_and_counted(tmp_path, blank, suffix):
+    """Rows with a component stay, whichever is missing; a map without such rows says nothing."""
+    cells = [("0.1", "0.2", "0.3"), blank, ("0.1", blank[0], "0.3"), blank]
+    (tmp_path / "map.csv").write_text("# probe: 3\n" + HEADER[:-1] + ",time_s\n" + "".join(
+        f"0,0,{number},{','.join(row)},{number}\n" for number, row in enumerate(cells)))
+    whole = np.array([[float(cell or "nan") for cell in row] for row in cells])
+    data = field_map([[0, 0, z] for z in range(4)], whole, attributes={"probe": "3"})
+    data["time_s"] = "point", np.arange(4.0)
+    write_map(data, tmp_path / "map.h5")
+    with pytest.warns(HalbachWarning, match="Left out: 2 of 4 rows of map .*; the first is row 2"):
+        found = checked_map(data, "`data`") if suffix == "in Python" else (
+            read_map(tmp_path / f"map{suffix}"))
+    np.testing.assert_array_equal(found["B_T"].values, whole[[0, 2]])
+    np.testing.assert_array_equal(found["time_s"].values, [0, 2])
+    np.testing.assert_array_equal(found["z_m"].values, [0, 2])
+    assert found.attrs == {"probe": "3"}
+    assert suffix == "in Python" or found.encoding["source"].endswith(suffix)
+    assert checked_map(found, "`data`").sizes["point"] == 2
 
 
 def test_repeated_readings_need_a_time_or_scan(tmp_path):

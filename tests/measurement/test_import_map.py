@@ -253,6 +253,8 @@ def test_an_unknown_encoding(tmp_path):
 def test_points_without_a_reading_are_left_out(tmp_path):
     found = imported(tmp_path, "x[m],y[m],z[m],Bx[T],Bz[T]\n0,0,0,,\n0,0,1,1,\n0,0,2,nan,NaN\n")
     assert (found.data.sizes["point"], found.dropped) == (1, 2)
+    assert found.remarks[-1].startswith("Left out: 2 of 3 rows of map ")
+    assert found.remarks[-1].endswith("; the first is row 1. Rows are counted without them.")
 
 
 def test_cylindrical_columns(tmp_path):

@@ -79,7 +79,7 @@ def test_components_may_have_a_column_of_the_magnitude(tmp_path):
     ("x_m,y_m,z_m,Babs_T\n0,0,0,-0.5\n", "never negative"),
     ("x_m,y_m,z_m,Bx_T,Babs_T\n0,0,0,0.5,0.5\n0,0,1,,0.4\n", "a map of their own"),
     ("x_m,y_m,z_m,Bx_T,sigma_Babs_T\n0,0,0,0.5,0.5\n", "Babs_T beside sigma_Babs_T"),
-    ("x_m,y_m,z_m,Babs_T\n0,0,0,\n", "at least one component"),
+    ("x_m,y_m,z_m,Babs_T\n0,0,0,\n", "at least one reading"),
     ("x_m,y_m,z_m,Babs_T,sigma_Babs_T\n0,0,0,0.5,0\n", "positive"),
     ("x_m,y_m,z_m\n0,0,0\n", "Babs_T")])
 def test_what_no_magnitude_is(text, words, tmp_path):

@@ -433,19 +433,21 @@ def test_the_region_of_a_magnet_away_from_the_origin(tmp_path):
     ring = ring_of_cubes()
     blocks = {name: values for name, values in blocks_table(ring).items()
               if name not in ("ring", "slot")}
-    there = magnet_of_blocks(blocks | {"z_m": np.array(blocks["z_m"]) + 0.3})
+    there = magnet_of_blocks(blocks | {
+        "x_m": np.array(blocks["x_m"]) - 0.2, "z_m": np.array(blocks["z_m"]) + 0.3})
+    assert there.middle_m == pytest.approx((-0.2, 0.0, 0.3))
     session = Session.open(tmp_path)
     here, found = (homogeneity(magnet, session) for magnet in (ring, there))
     for name in ("mean_T", "rms_ppm", "peak_to_peak_ppm"):
         assert getattr(found.by_name["prior"], name) == pytest.approx(
             getattr(here.by_name["prior"], name), rel=1e-6)
-    assert "about (0, 0, 300) mm" in answer(found).question
+    assert "about (-200, 0, 300) mm" in answer(found).question
     asked = there.with_(homogeneity={"sphere_m": 0.01})
-    assert default_region(asked) == Region.sphere(0.01, (0.0, 0.0, there.middle_z_m))
+    assert default_region(asked) == Region.sphere(0.01, there.middle_m)
     stated = there.with_(homogeneity={"sphere_m": 0.01, "centre_m": (0.0, 0.0, 0.0)})
     assert default_region(stated) == Region.sphere(0.01)
     options = argparse.Namespace(sphere_m=0.02, ellipsoid_m=None, cylinder_m=None, centre_m=None)
-    assert region_of(options, there) == Region.sphere(0.02, (0.0, 0.0, there.middle_z_m))
+    assert region_of(options, there) == Region.sphere(0.02, there.middle_m)
     assert region_of(options, stated) == Region.sphere(0.02)
     before = homogeneity(there, session, default_region(ring)).by_name["prior"]
     assert before.mean_T < 0.1 * here.by_name["prior"].mean_T
@@ -507,6 +509,7 @@ def test_error_bars_have_that_of_the_solver(tmp_path):
     (["--centre-m", "0", "0", "1"], "must be beside a region"),
     (["--sphere-m", "0.005", "--centre-m", "0", "0", "10"], "where there is some field"),
     (["--cylinder-m", "0.005", "19"], "where there is some field"),
+    (["--sphere-m", "0.3", "--centre-m", "0", "0", "0.3"], "m. Stay nearer to the magnet."),
     (["--cylinder-m", "0.005", "100"], "Was it meant in millimetres?"),
 ])
 def test_bad_regions(tmp_path, capsys, options, sentence):

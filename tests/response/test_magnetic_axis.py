@@ -189,16 +189,20 @@ def test_the_centre_of_blocks_that_deviate_is_where_the_field_is_stationary(gene
 def test_a_magnet_has_the_same_axis_wherever_it_lies(generator, tmp_path, order, free):
     """Heights and sphere were about z = 0, beside free blocks 0.3 m away, and rings that their z_m
     put there: the roll was another, the slopes those of the fringe field, and a dipole had no
-    centre. Control: other blocks.
+    centre. Of free blocks beside the z axis all of these were of the field on that axis. Control:
+    other blocks.
     """
-    away = 0.3  # m
+    away = np.array([0.1, -0.2, 0.3] if free else [0.0, 0.0, 0.3])  # m
     ring = hf.halbach_ring(order=order, blocks=8, inner_radius_m=0.02, outer_radius_m=0.05,
                            length_m=0.06, rings=2)
     blocks = {name: values for name, values in blocks_table(ring).items()
               if name not in ("ring", "slot")}
     here, there = (
-        hf.magnet_of_blocks(blocks | {"z_m": np.array(blocks["z_m"]) + z}, order=order) if free else
-        ring.with_(array__ring=[{"z_m": z - 0.015}, {"z_m": z + 0.015}]) for z in (0.0, away))
+        hf.magnet_of_blocks(blocks | {
+            name: np.array(blocks[name]) + more
+            for name, more in zip(("x_m", "y_m", "z_m"), shift, strict=True)}, order=order)
+        if free else ring.with_(array__ring=[{"z_m": shift[2] - 0.015}, {"z_m": shift[2] + 0.015}])
+        for shift in (np.zeros(3), away))
     nominal = here.nominal_magnetization
     errors = 1e-3 * np.abs(nominal).max() * generator.standard_normal((2, len(nominal)))
 
@@ -209,8 +213,7 @@ def test_a_magnet_has_the_same_axis_wherever_it_lies(generator, tmp_path, order,
                           found.centre_sd_m, found.slope_sd_rad or [], found.roll_sd_rad])
 
     found, moved = axis(here, errors[0]), axis(there, errors[0])
-    if order == 1:
-        moved[2] -= away
+    moved[:len(away) - (order > 1)] -= away[:len(away) - (order > 1)]
     rounding = 1e-6
     assert moved == pytest.approx(found, rel=rounding, abs=rounding * 1e-3)
     assert moved != pytest.approx(axis(here, errors[1]), rel=0.1)

@@ -16,7 +16,7 @@ from halbach_fe.solver.exact_block_field import coil_field, dipole_field, neighb
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.separate_blocks import external_acts
 from halbach_fe.study.external import AnyCoil, Neighbour, PointDipole
-from halbach_fe.study.iron import FroehlichKennellyCurve, IronRing, SteelCurve
+from halbach_fe.study.iron import FroehlichKennellyCurve, Iron, IronRing, IronTube, SteelCurve
 from halbach_fe.study.model import Study, iron_of
 
 
@@ -59,7 +59,8 @@ class NeighbourMagnetEffect(Effect):
         gaps_m = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
         if study.dimension == 2:
             return []
-        length = 2 * build_magnet(study).array_half_length
+        low, high = build_magnet(study).array_ends
+        length = high - low
         return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in gaps_m]
 
     def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
@@ -117,13 +118,14 @@ class FerromagneticObjectEffect(Effect):
         if study.dimension == 2:
             return []
         magnet = build_magnet(study)
-        half, outer = magnet.array_half_length, magnet.array_outer_radius
+        (low, high), outer = magnet.array_ends, magnet.array_outer_radius
         radii = [magnet.bore_radius, outer, 1.4 * outer]
-        heights = [side * (half + beyond) for side in (-1, 1) for beyond in beyond_m]
+        heights = [*(low - np.array(beyond_m)), *(high + np.array(beyond_m))]
         ends = [(r, z) for r in radii for z in heights]
-        outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
+        outside = [(1.2 * outer, z) for z in np.linspace(low, high, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
-        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
+        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights
+                if not low - 0.1 <= z <= high + 0.1]
         found = axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
                         for r, z in ends + outside for a in angles]
         inside = magnet.contains(np.array([place.at_m for place in found]))
@@ -236,7 +238,10 @@ class IronRingEffect(Effect):
     def places(self, study: Study) -> Sequence[Place]:
         if iron_of(study) is not None or study.prior.variation_sd:  # which no study has beside iron
             return []
-        blocks = build_magnet(study).array_outer_radius
+        magnet = build_magnet(study)
+        if any(magnet.middle_m[:2]):  # a tube is about the z axis
+            return []
+        blocks = magnet.array_outer_radius
         return [Place(at_m=(inner := blocks + gap, outer := inner + thickness),
                       words=f"radii of {1e3 * inner:.4g} and {1e3 * outer:.4g} mm")
                 for gap, thickness in ((0.004, 0.002), (0.004, 0.01), (0.004, 0.005),
@@ -282,11 +287,16 @@ class IronRingEffect(Effect):
         # they are not saturated; cast iron has 1.6 T
         lowest_T, typical_T, highest_T = 1.2, 2.0, 2.5
         least, typical = 0.1, 1000.0
-        return study.with_(iron_ring=IronRing(
-            inner_radius_m=inner, outer_radius_m=inner + thickness, curve=FroehlichKennellyCurve(
-                kind="froehlich_kennelly",
-                initial_relative_permeability=typical * max(1 + more, least),
-                saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))))
+        curve = FroehlichKennellyCurve(
+            kind="froehlich_kennelly", initial_relative_permeability=typical * max(1 + more, least),
+            saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))
+        (low, high), middle = build_magnet(study).array_ends, build_magnet(study).middle_z_m
+        if not middle:
+            return study.with_(iron_ring=IronRing(
+                inner_radius_m=inner, outer_radius_m=inner + thickness, curve=curve))
+        return study.with_(iron=Iron(curve=curve, bodies=(IronTube(
+            kind="tube", inner_radius_m=inner, outer_radius_m=inner + thickness,
+            length_m=high - low, z_m=middle),)))
 
 
 STEEL = "aisi_1010"

@@ -21,6 +21,7 @@ from halbach_fe.measurement.field_map import (
     is_placeholder,
     undirected,
     with_total_field,
+    without_reading,
 )
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
@@ -158,7 +159,8 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     ignored = tuple(column.text for index, column in enumerate(columns)
                     if index not in used.values() and column.text)
     remarks = (*table.remarks, *_overridden(columns, table, declared),
-               *_remarks(columns, used, unit_of, table, declared))
+               *_remarks(columns, used, unit_of, table, declared),
+               *([] if read.all() else [without_reading(~read, table.where)]))
     return ImportedMap(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
                        int((~read).sum()), "Br" in si, remarks)
 

@@ -17,12 +17,12 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
+from halbach_fe.core.errors import MeasurementError, OutputError, StudyError, must_be, printable
 from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
     TO_METRES,
-    check_readings,
+    checked_readings,
     doubt_of_metres,
     labelled_map,
     read_map,
@@ -47,8 +47,9 @@ from halbach_fe.measurement.formats.grid import (
     read_opera,
     read_srw,
 )
-from halbach_fe.measurement.formats.units import in_si, unit_symbol
+from halbach_fe.measurement.formats.units import FIELDS, LENGTHS, in_si, unit_symbol
 from halbach_fe.measurement.tables import Line, csv_table, finite, lines_of, text_of_table
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
@@ -68,6 +69,9 @@ SUFFIXES = {"csv": (".csv",), "vtu": (".vtu",), "openpmd": (".h5", ".hdf5")}
 """Suffixes of the formats that have a usual one."""
 WRITERS = (*GRIDS, "csv", "vtu")
 """Names of the formats to which a map can be exported."""
+CONVERTED = {"imported_length_unit": "length_unit_m", "imported_field_unit": "flux_density_unit_T"}
+"""Attributes of an imported map with the units from which it was converted, and the keys of an
+instrument that state units of maps."""
 MAX_NAME = 255
 """Largest number of characters of a file name in the attributes of an imported map."""
 
@@ -100,11 +104,34 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     if declared.positions is not None:
         table = with_positions(table, declared.positions, declared.length_unit)
     found = to_map(table, declared)
-    data = found.data
-    check_readings(data, path)
+    data = checked_readings(found.data, path)
     data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
-                   "imported_sha256": hashlib.sha256(raw).hexdigest()}
-    return _with_doubt(replace(found, format=name), declared)
+                   "imported_sha256": hashlib.sha256(raw).hexdigest()} | {
+        name: units[0] for name, units in zip(CONVERTED, (found.length_units, found.field_units),
+                                              strict=True) if len(units) == 1}
+    return _with_doubt(replace(found, data=data, format=name), declared)
+
+
+def refuse_units_twice(data: xr.Dataset, instrument: Instrument, path: Path | str) -> None:
+    """Refuse a study's units for a map that was converted from units of its own by `import_map`.
+
+    Factors that are the size of no unit remain: they correct what a file says.
+
+    Raises
+    ------
+    StudyError
+        If both say a unit.
+    """
+    for (name, key), (option, known) in zip(CONVERTED.items(), (
+            ("length", LENGTHS), ("field", FIELDS)), strict=True):
+        size, unit = getattr(instrument, key), unit_symbol(str(data.attrs.get(name, "")))
+        if unit not in ("", "m", "T") and size != 1 and np.isclose(
+                size, [float(each) for each in known.values()], atol=0).any():
+            raise StudyError(must_be(
+                f"`instrument.{key}`", "the study", f"left out for map {path}, which was converted "
+                f"from {unit}, as its header or --{option}-unit says", f"{size:g}, by which it "
+                "would be converted again", "Remove the key. If the file is wrong about its unit, "
+                "state another by --columns, as in x[mm],y[mm],z[mm],Bx[mT]."))
 
 
 def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
