@@ -113,6 +113,11 @@ class SortedBlocks(ShownInNotebook):
         return len(set(self.table.type)) < len(self.table)
 
     @property
+    def types_in_words(self) -> str:
+        """Types that the study could state, see `types_in_words`."""
+        return types_in_words(self.alike, self.own_order != "as numbered")
+
+    @property
     def matters(self) -> bool:
         """Whether orders differ at all in what is made small.
 
@@ -177,11 +182,13 @@ def sort_blocks(
     mounts = mounts_of(as_meant(magnet))
     blocks = _blocks(magnet, table, model, mounts, turns)
     alike = _alike(magnet, mounts)
+    placed = _placed_order(table, magnet)
     if len(set(table.type)) == len(table):
+        types = types_in_words(alike, placed is not None)
         warnings.warn(f"Every block of study {magnet.name} is of a different type and fits only "
                       "one slot: there is nothing to sort. State in prior.types which slots take "
-                      f"the same blocks{types_in_words(alike)}, or measure spare blocks.",
-                      HalbachWarning, stacklevel=2)
+                      f"the same blocks{types}, or measure spare blocks.", HalbachWarning,
+                      stacklevel=2)
     count = len(model.orders) if isinstance(model, MultipoleModel) else 1
     numbered = _name_places(magnet, table, _order(blocks))
     known = _assembled(magnet, numbered, model)
@@ -210,7 +217,7 @@ def sort_blocks(
     # assignments count in units of a main multipole that no order changes; results in their own
     in_these_units = Assignment.of(blocks.slots, _order(blocks), blocks.offset).square / count
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
-    if (placed := _placed_order(table, magnet)) is not None:
+    if placed is not None:
         known = _assembled(magnet, _name_places(magnet, table, placed), model)
     result = _name_places(magnet, table, best.order, mounts.turns[best.turn])
     after = _assembled(magnet, result, model)
@@ -223,8 +230,11 @@ def sort_blocks(
         prior_from_blocks(magnet, result).doubts)
 
 
-def types_in_words(alike: dict[str, tuple[int, ...]]) -> str:
-    """Return the types that a study could state, as its file would; nothing if all slots differ."""
+def types_in_words(alike: dict[str, tuple[int, ...]], given: bool) -> str:
+    """Return the types that a study could state, as its file would; nothing if all slots differ.
+
+    Blocks whose places are not ``given`` need these names, which is said too.
+    """
     if all(len(slots) == 1 for slots in alike.values()):
         return ""
     found = []
@@ -234,7 +244,9 @@ def types_in_words(alike: dict[str, tuple[int, ...]]) -> str:
         if len(slots) > shown_slots and slots == tuple(range(slots[0], slots[-1] + 1)):
             text = f"{slots[0]}, {slots[0] + 1}, ..., {slots[-1]}"
         found.append(f"{name} = [{text}]")
-    return f" ({'; '.join(found)})"
+    named = "" if given else (", and write these names into the column type of the table, with "
+                              "moments as mounted in the first slot of each")
+    return f" ({'; '.join(found)}){named}"
 
 
 def _alike(magnet: Magnet, mounts: Mounts) -> dict[str, tuple[int, ...]]:

@@ -420,17 +420,22 @@ def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
 
 
 def with_types(magnet: Magnet, table: BlockTable) -> BlockTable:
-    """Return a table with the types that follow from the places of its blocks.
+    """Return a table with the types that follow from the places of its blocks, where it states
+    none, or that of a slot which the study has in no other type.
 
     Raises
     ------
     MeasurementError
         If the table is not valid any more, as its arrays were changed after it was read.
     """
+    types = types_of(magnet)
     label_of = {(magnet.blocks[number].ring, magnet.blocks[number].slot): label
-                for label, members in types_of(magnet).items() for number in members}
-    return replace(table, type=tuple(own or label_of.get(place, "") for own, place in zip(
-        table.type, table.places, strict=True)))
+                for label, members in types.items() for number in members}
+    # the number of its slot is the type of a block before the study's prior.types names others
+    return replace(table, type=tuple(
+        label_of.get(place, "") if own == str(place[1]) and own not in types else
+        own or label_of.get(place, "")
+        for own, place in zip(table.type, table.places, strict=True)))
 
 
 def first_of_types(magnet: Magnet) -> dict[str, int]:

@@ -13,7 +13,7 @@ from halbach_fe.core.arrays import slices
 from halbach_fe.design.assembly import turn_in_words
 from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.ring_catalogue import obstacle
-from halbach_fe.design.sorting import SortedBlocks, types_in_words
+from halbach_fe.design.sorting import SortedBlocks
 from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES
@@ -179,7 +179,7 @@ def _answer(found: SortedBlocks) -> Answer:
             f"{text(best)} {unit}.{_limit(found)}", "Yes: blocks go only into slots of their own "
             "type, as they lie, and here every slot has its own. (halbach-fe shim also turns "
             "blocks upside down.)", "If blocks of some slots are alike, say so in the study "
-            f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
+            f"by prior.types{found.types_in_words}; or measure spare blocks. Then sort "
             "again.",
             f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
     prior = found.study.prior  # and what the uncertainty of the blocks makes
@@ -219,7 +219,7 @@ def _more(found: SortedBlocks) -> str:
     if stated == {frozenset(slots) for slots in found.alike.values()}:
         return "measure spare blocks: all slots whose blocks are alike take the same ones already"
     return ("let more slots take the same blocks by prior.types of the study"
-            f"{types_in_words(found.alike)}")
+            f"{found.types_in_words}")
 
 
 def _ordered(found: SortedBlocks) -> str:

@@ -172,13 +172,30 @@ def test_types_stay_in_their_slots(session):
                     np.random.default_rng(1))
 
 
-def test_where_there_is_no_choice_it_is_said(session):
+@pytest.mark.usefixtures("few_starts")
+@pytest.mark.parametrize("placed", [True, False])
+def test_the_advice_of_types_can_be_followed(session, placed):
+    """The table of a coil names the slot of each block as its type; that was refused afterwards."""
     study = study_of(**SQUARES)
-    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
+    magnet = build_magnet(study)
+    model = multipole_model(magnet, MultipoleReference(RADIUS, ORDERS), session)
     nominal = magnet_of(study)
     table, _ = coil_table(study, nominal, nominal, COIL_SD, np.random.default_rng(0))
-    with pytest.warns(HalbachWarning, match="nothing to sort"):
-        sort_blocks(build_magnet(study), table, model, np.random.default_rng(0))
+    assert len(set(table.type)) == len(table)
+    none = np.zeros(len(table), int)
+    with pytest.warns(HalbachWarning, match=r"type_1 = \[1, 2, \.\.\., 12\]\)") as said:
+        found = sort_blocks(magnet, table if placed else replace(table, ring=none, slot=none),
+                            model, np.random.default_rng(0))
+    advised = study.with_(prior__types=found.alike)
+    if not placed:  # only the one who measured them can tell how they were mounted
+        assert "column type of the table, with moments as mounted in the first" in str(said[0])
+        moment = as_mounted(magnet, table, none)
+        table = replace(table, type=("type_1",) * len(table), ring=none, slot=none, moment=moment)
+    assert sort_blocks(build_magnet(advised), table, model, np.random.default_rng(0)).has_choice
+    if placed:
+        with pytest.raises(MeasurementError, match=r"one of the study's: type_1; instead .*'2'"):
+            sort_blocks(build_magnet(advised), replace(table, type=("2", *table.type[1:])), model,
+                        np.random.default_rng(0))
 
 
 @pytest.mark.usefixtures("few_starts")
