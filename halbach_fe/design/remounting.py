@@ -12,19 +12,16 @@ transverse and along z.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
-from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import as_meant, mountings
-from halbach_fe.study.array import MAX_FACTOR, BlockException
+from halbach_fe.geometry.symmetry import as_meant, mountings, properties, rotation_deg
 
 LARGEST_ANGLE = np.radians(2.0)
 """Largest angle in rad between the nominal magnetization of a block that fits a slot and the
@@ -174,114 +171,7 @@ def _directions(blocks: Sequence[MagnetBlock], frames: Floats) -> Floats:
 
 def _kinds(blocks: Sequence[MagnetBlock], shapes: Ints) -> Ints:
     """Return equal numbers for blocks of equal shape, remanence and recoil permeabilities."""
-    kinds = [(shape, *(float(f"{value:.9g}") for value in _properties(block)[:3]))
+    kinds = [(shape, *(float(f"{value:.9g}") for value in properties(block)[:3]))
              for block, shape in zip(blocks, shapes.tolist(), strict=True)]
     numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds))}
     return np.array([numbers[kind] for kind in kinds])
-
-
-def rotation_deg(turn: Floats) -> tuple[float, float, float]:
-    """Return the rotation vector in degrees of a matrix (3, 3), rounded to 1e-9 degrees."""
-    x, y, z = (np.degrees(Rotation.from_matrix(turn).as_rotvec()).round(9) + 0.0).tolist()
-    return x, y, z
-
-
-OF_A_BLOCK = ("remanence_T", "recoil_permeability", "recoil_permeability_across",
-              "magnetization_gradient", "inner_corner_loss")
-"""Keys of an exception that a block takes along, but for its factor; in the order of
-`_properties`."""
-
-
-def remounted(
-    magnet: Magnet, moved: Iterable[tuple[int, int, Floats]], renewed: Iterable[int] = ()
-) -> Magnet | None:
-    """Return the magnet after blocks are moved.
-
-    The moves are entered in the study as exceptions (``mounted_from`` and ``rotation_deg``), in
-    place of what exceptions said of how these blocks were mounted before. A block takes the
-    exceptions of its material and strength along; those of a slot's position stay.
-
-    Parameters
-    ----------
-    moved : iterable of (int, int, ndarray)
-        For each moved block, its new and its old slot (counted from 0, ring by ring), and the
-        matrix (3, 3) that maps its magnetization in the old slot to that in the new slot, along
-        the axes of the magnet.
-    renewed : iterable of int, optional
-        Slots (counted from 0) that new blocks are put into, as they are designed.
-
-    Returns
-    -------
-    Magnet or None
-        None if the exceptions of a study cannot express the moves.
-    """
-    before, old, of_block = mountings(magnet), magnet.blocks, exceptions_of(magnet.array)
-    moved = list(moved)
-    kept = _of_positions(magnet, [*(to for to, _, _ in moved), *renewed])
-    still, of_slot = magnet.with_(array__exceptions=kept).blocks, exceptions_of(
-        magnet.array.with_(exceptions=kept))
-    exceptions, expected = [], {}
-    for to, source, matrix in moved:
-        meant, earlier = before[source]
-        total = matrix @ earlier
-        factor, left = (magnetization_factor(of(block.ring, block.slot)) for of, block in (
-            (of_block, old[source]), (of_slot, still[to])))
-        here = rotation_about_z(np.radians(old[to].angle_deg))  # axes of `rotation_deg`
-        changed: dict[str, Any] = {}
-        if factor and left:
-            if abs(factor / left) > MAX_FACTOR:
-                return None
-            turned = total / factor @ old[to].carried_from(old[meant]).T
-            vector = np.array(rotation_deg(here.T @ turned @ here)) - np.degrees(
-                here.T @ still[to].rotation_rad)
-            changed = {"rotation_deg": vector.round(9) + 0.0,
-                       "magnetization_factor": factor / left,
-                       **_taken_along(old[source], factor, still[to], left)}
-        exceptions.append(BlockException.model_validate({
-            "ring": old[to].ring, "slot": old[to].slot,
-            "mounted_from": old[meant].place, **changed}))
-        expected[to] = source, meant, total
-    after_all = magnet.with_(array__exceptions=(*kept, *exceptions))
-    after, new = mountings(after_all), after_all.blocks
-    # tolerance for matrices and properties that must be equal; rounding errors are 1e-15
-    exact = 1e-9
-    for to, (source, meant, total) in expected.items():
-        same = after[to][0] == meant and np.allclose(after[to][1], total, 0, exact)
-        if not same or new[to].displacement_m != old[to].displacement_m or not np.allclose(
-                _properties(new[to]), _properties(old[source]), exact, 0):
-            return None
-    return after_all
-
-
-def _of_positions(magnet: Magnet, slots: Iterable[int]) -> tuple[BlockException, ...]:
-    """Return the exceptions of a magnet, without what those of single slots (counted from 0) say of
-    the block that is there and how it is mounted.
-    """
-    places = {magnet.blocks[slot].place for slot in slots}
-    left = {name: field.default for name, field in BlockException.model_fields.items()
-            if name in (*OF_A_BLOCK, "magnetization_factor", "mounted_from", "rotation_deg")}
-    kept = [one.with_(**left) if magnet.array.block_of(one) in places else one
-            for one in magnet.array.exceptions]
-    return tuple(one for one in kept
-                 if one.model_dump(exclude_defaults=True).keys() - {"ring", "slot"})
-
-
-def _taken_along(
-    block: MagnetBlock, factor: float, there: MagnetBlock, left: float
-) -> dict[str, float]:
-    """Return what an exception says of a moved block where it is other than the block of its slot.
-
-    ``factor`` and ``left`` are the magnetization factors of the two, which are not part of it.
-    """
-    own, other = (np.array(_properties(each)) / [divisor, 1.0, 1.0, 1.0, 1.0]
-                  for each, divisor in ((block, factor), (there, left)))
-    differs = ~np.isclose(own, other, 1e-9, 0)
-    differs[2] |= differs[1]  # the permeability alone holds in all directions
-    return {name: value for name, value, unlike in zip(
-        OF_A_BLOCK, own.tolist(), differs.tolist(), strict=True) if unlike}
-
-
-def _properties(block: MagnetBlock) -> tuple[float, ...]:
-    """Return the properties that a block keeps when it is moved."""
-    return (block.remanence, block.recoil_permeability, block.recoil_permeability_across,
-            block.gradient, block.corner_loss)

@@ -33,10 +33,10 @@ from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Known, Objective
-from halbach_fe.design.remounting import Mounts, mounts_of, remounted
+from halbach_fe.design.remounting import Mounts, mounts_of
 from halbach_fe.design.sorting import Slots
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import as_meant
+from halbach_fe.geometry.symmetry import as_meant, remounted
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable

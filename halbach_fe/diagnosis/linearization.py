@@ -13,6 +13,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
+from halbach_fe.diagnosis.effects.blocks import AssemblyEffect
 from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -80,8 +81,12 @@ class NominalSolver:
 
 
 def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
-    """Return the study with identified effects applied at their amplitudes."""
-    for effect in identified:
+    """Return the study with identified effects applied at their amplitudes.
+
+    Blocks are moved first: what has a place is about the block that is there after all moves.
+    """
+    for effect in sorted(identified, key=lambda one: not isinstance(
+            one.hypothesis.effect, AssemblyEffect)):
         study = effect.hypothesis.apply(study, effect.values.tolist())
     return study
 

@@ -15,9 +15,10 @@ which they fit a slot are found by their shapes, so that they exist for rings an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,7 @@ from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, at_heights, outline_contains, points_on
-from halbach_fe.study.array import Array
+from halbach_fe.study.array import MAX_FACTOR, Array, BlockException
 from halbach_fe.study.external import External
 
 _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -270,6 +271,121 @@ def is_as_meant(block: MagnetBlock, meant: MagnetBlock, angle: float) -> bool:
                        for each in (_corners(block), _corners(meant)))
     chord = 2 * np.sin(angle / 2) * np.linalg.norm(others, axis=1).max()
     return _apart(corners, others) <= chord
+
+
+def rotation_deg(turn: Floats) -> tuple[float, float, float]:
+    """Return the rotation vector in degrees of a matrix (3, 3), rounded to 1e-9 degrees."""
+    x, y, z = (np.degrees(Rotation.from_matrix(turn).as_rotvec()).round(9) + 0.0).tolist()
+    return x, y, z
+
+
+OF_A_BLOCK = ("remanence_T", "recoil_permeability", "recoil_permeability_across",
+              "magnetization_gradient", "inner_corner_loss")
+"""Keys of an exception that a block takes along, but for its factor; in the order of
+`properties`."""
+
+
+def remounted(
+    magnet: Magnet, moved: Iterable[tuple[int, int, Floats]], renewed: Iterable[int] = ()
+) -> Magnet | None:
+    """Return the magnet after blocks are moved.
+
+    The moves are entered in the study as exceptions (``mounted_from`` and ``rotation_deg``), in
+    place of what exceptions said of how these blocks were mounted before. A block takes the
+    exceptions of its material and strength along; those of a slot's position stay.
+
+    Parameters
+    ----------
+    moved : iterable of (int, int, ndarray)
+        For each moved block, its new and its old slot (counted from 0, ring by ring), and the
+        matrix (3, 3) that maps its magnetization in the old slot to that in the new slot, along
+        the axes of the magnet.
+    renewed : iterable of int, optional
+        Slots (counted from 0) that new blocks are put into, as they are designed.
+
+    Returns
+    -------
+    Magnet or None
+        None if the exceptions of a study cannot express the moves.
+    """
+    before, old, of_block = mountings(magnet), magnet.blocks, exceptions_of(magnet.array)
+    moved, nominal = list(moved), nominal_blocks(magnet.array, magnet.dimension)
+    kept = _of_positions(magnet, [*(to for to, _, _ in moved), *renewed])
+    still, of_slot = magnet.with_(array__exceptions=kept).blocks, exceptions_of(
+        magnet.array.with_(exceptions=kept))
+    # tolerance for matrices and properties that must be equal; rounding errors are 1e-15
+    exact = 1e-9
+    exceptions, expected = [], {}
+    for to, source, matrix in moved:
+        meant, earlier = before[source]
+        total = matrix @ earlier
+        factor, left = (magnetization_factor(of(block.ring, block.slot)) for of, block in (
+            (of_block, old[source]), (of_slot, still[to])))
+        here = rotation_about_z(np.radians(old[to].angle_deg))  # axes of `rotation_deg`
+        if abs(factor) > MAX_FACTOR * abs(left):
+            return None
+        changed: dict[str, Any] = {"magnetization_factor": factor / left if left else 1.0}
+        if factor:
+            carried = old[to].carried_from(old[meant])
+            turned = total / factor @ carried.T
+            vector = np.array(rotation_deg(here.T @ turned @ here)) - np.degrees(
+                here.T @ still[to].rotation_rad)
+            changed |= {"rotation_deg": vector.round(9) + 0.0,
+                        **_taken_along(old[source], factor, still[to], left)}
+            direction = turned.T @ matrix @ old[source].easy_axis
+            if not np.allclose(direction, carried @ nominal[meant].easy_axis, 0, exact):
+                changed["magnetization_angle_deg"] = np.degrees(
+                    np.arctan2(direction[1], direction[0])).round(9)
+        exceptions.append(BlockException.model_validate({
+            "ring": old[to].ring, "slot": old[to].slot,
+            "mounted_from": old[meant].place, **changed}))
+        expected[to] = source, meant, total, matrix @ old[source].polarization
+    after_all = magnet.with_(array__exceptions=(*kept, *exceptions))
+    after, new = mountings(after_all), after_all.blocks
+    for to, (source, meant, total, polarization) in expected.items():
+        same = after[to][0] == meant and np.allclose(after[to][1], total, 0, exact) and np.allclose(
+            new[to].polarization, polarization, 0, exact)
+        if not same or new[to].displacement_m != old[to].displacement_m or not np.allclose(
+                properties(new[to]), properties(old[source]), exact, 0):
+            return None
+    return after_all
+
+
+def _of_positions(magnet: Magnet, slots: Iterable[int]) -> tuple[BlockException, ...]:
+    """Return the exceptions of a magnet, without what those of single slots (counted from 0) say of
+    the block that is there and how it is mounted.
+    """
+    if any(name.startswith("array.exceptions") for one in magnet.study.uncertain
+           for name in one.change):  # by their numbers
+        return magnet.array.exceptions
+    places = {magnet.blocks[slot].place for slot in slots}
+    left = {name: field.default for name, field in BlockException.model_fields.items()
+            if name in (*OF_A_BLOCK, "magnetization_factor", "mounted_from", "rotation_deg")}
+    kept = [one.with_(**left) if magnet.array.block_of(one) in places else one
+            for one in magnet.array.exceptions]
+    return tuple(one for one in kept
+                 if one.model_dump(exclude_defaults=True).keys() - {"ring", "slot"})
+
+
+def _taken_along(
+    block: MagnetBlock, factor: float, there: MagnetBlock, left: float
+) -> dict[str, float]:
+    """Return what an exception says of a moved block where it is other than the block of its slot.
+
+    ``factor`` and ``left`` are the magnetization factors of the two, which are not part of it.
+    """
+    own, other = (np.array(properties(each)) / [divisor, 1.0, 1.0, 1.0, 1.0]
+                  for each, divisor in ((block, factor), (there, left)))
+    differs = ~np.isclose(own, other, 1e-9, 0)
+    differs[2] |= differs[1]  # the permeability alone holds in all directions
+    return {name: value for name, value, unlike in zip(
+        OF_A_BLOCK, own.tolist(), differs.tolist(), strict=True) if unlike}
+
+
+def properties(block: MagnetBlock) -> tuple[float, ...]:
+    """Return the properties that a block keeps when it is moved."""
+    return (block.remanence, block.recoil_permeability, block.recoil_permeability_across,
+            block.gradient, block.corner_loss)
 
 
 Turn = tuple[tuple[float, float, float], ...]

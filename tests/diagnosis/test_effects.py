@@ -10,12 +10,13 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import blocks, catalogue
-from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.linearization import amplitude_scale
+from halbach_fe.diagnosis.effects.base import Hypothesis, Place
+from halbach_fe.diagnosis.linearization import amplitude_scale, apply_effects
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import mountings
+from halbach_fe.geometry.symmetry import mountings, properties
 from halbach_fe.measurement.instrument import (
     nonlinear_part,
     probe_points,
@@ -37,6 +38,12 @@ IN_IRON = STUDY.with_(external={}, iron={"relative_permeability": 30.0, "bodies"
      "curve": {"kind": "steel", "name": "aisi_1010"}},
     {"kind": "sphere", "radius_m": 0.05, "centre_m": [0.4, 0.0, 0.0],
      "relative_permeability": 1.2}]})
+SPACED = STUDY.with_(
+    external={}, array__rings=3, array__blocks_per_ring=8, array__ring_gap_m=0.01,
+    array__first_magnetization_angle_deg=30.0,
+    array__block={"shape": "trapezoid", "side_gap_m": 0.005})
+"""Rings and blocks that are turned by some degrees without overlaps."""
+
 POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
 TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
@@ -87,6 +94,55 @@ def test_signatures_are_derivatives(name, nominal):
             assert np.abs(change + step * signature[number]).max() > size
             exchanged = np.abs(change - step * signature[number][:, [1, 2, 0]]).max()
             assert exchanged > 0.5 * size or effect.of_total_field  # in which all are alike
+
+
+OF_ITS_OWN = {
+    "weaker": [{"ring": 1, "slot": 2, "magnetization_factor": 0.8}],
+    "ring": [{"ring": 1, "magnetization_factor": 0.9, "twist_deg": 0.5}],
+    "reversed": [{"ring": 1, "slot": 2, "magnetization_factor": -1.0}],
+    "missing": [{"ring": 1, "slot": 2, "magnetization_factor": 0.0}],
+    "angle": [{"ring": 1, "slot": 2, "magnetization_angle_deg": 77.0}],
+    "exchanged": [{"ring": 1, "slot": 2, "mounted_from": (1, 3)},
+                  {"ring": 1, "slot": 3, "mounted_from": (1, 2), "rotation_deg": (180, 0, 0)}],
+    "turned": [{"ring": 1, "slot": 2, "rotation_deg": (3.0, 2.0, 1.0)}],
+    "uneven": [{"ring": 1, "slot": 2, "magnetization_gradient": 0.05},
+               {"ring": 2, "inner_corner_loss": 0.1}],
+    "permeable": [{"ring": 1, "slot": 2, "recoil_permeability": 1.1,
+                   "recoil_permeability_across": 1.15}]}
+"""Exceptions that a study, or an effect found before, has made of blocks that are then moved."""
+
+
+@pytest.mark.parametrize("exceptions", OF_ITS_OWN.values(), ids=OF_ITS_OWN)
+def test_blocks_are_moved_as_they_are(exceptions):
+    """With all that the study says of them: what is built is what the signature changes."""
+    study = SPACED.with_(array__exceptions=exceptions)
+    before = build_magnet(study)
+    nominal = NominalFields(study, POINTS, TIME, None)
+    for name in ("block_put_in_wrongly", "blocks_swapped", "rings_swapped", "rings_turned",
+                 "rings_upside_down"):
+        for place in EFFECTS[name].places(study)[:4]:
+            after = build_magnet(EFFECTS[name].apply(study, place, [1.0]))
+            expected = before.nominal_magnetization.reshape(-1, 3)
+            for number, change in EFFECTS[name].magnetization_change(nominal, place).items():
+                expected[number] += change
+            np.testing.assert_allclose(after.nominal_magnetization, expected.ravel(), atol=1.0)
+            for to, source, _ in EFFECTS[name].sources(before, place):
+                assert properties(after.blocks[to])[1:] == pytest.approx(
+                    properties(before.blocks[source])[1:], rel=1e-9)
+
+
+def test_effects_of_a_block_are_those_of_the_one_that_is_moved_there():
+    """In which order ever they were found: one that was weaker before is another one's loss."""
+    place = EFFECTS["blocks_swapped"].places(SPACED)[1]
+    swap, loss = (IdentifiedEffect(Hypothesis(EFFECTS[name], where), np.array([value]), np.zeros(1),
+                                   None)
+                  for name, where, value in (("blocks_swapped", place, 1.0), (
+                      "block_demagnetized", Place(place.ring, place.slot), 0.2)))
+    found = [build_magnet(apply_effects(SPACED, order)).blocks
+             for order in ([swap, loss], [loss, swap])]
+    assert found[0] == found[1]
+    whole = build_magnet(SPACED).blocks[0].remanence
+    assert [block.remanence / whole for block in found[0][:3]] == pytest.approx([1, 0.8, 1])
 
 
 def solved(study):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.diagnosis.effects.base import (
     Effect,
     MagnetizationEffect,
@@ -26,7 +26,7 @@ from halbach_fe.diagnosis.effects.base import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import Move, moves_of_rings, turns_in_slot
+from halbach_fe.geometry.symmetry import Move, moves_of_rings, remounted, turns_in_slot
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -207,10 +207,19 @@ class AssemblyEffect(Effect):
         return _change(self.sources(nominal.magnet, place), nominal.magnetizations)
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`.
+
+        Raises
+        ------
+        StudyError
+            If exceptions cannot say the move, see `remounted`.
+        """
         magnet = build_magnet(study)
-        return with_exceptions(study, [
-            _exception(magnet.blocks[to], magnet.blocks[source], turn)
-            for to, source, turn in self.sources(magnet, place)])
+        moved = remounted(magnet, self.sources(magnet, place))
+        if moved is None:
+            raise StudyError(must_be(
+                self.title, f"study {study.name}", "a move that exceptions can say", place.name))
+        return moved.study
 
 
 def _change(sources: Sources, magnetizations: Floats) -> dict[int, Floats]:
@@ -228,29 +237,6 @@ def _rounded(change: dict[int, Floats], vectors: Floats) -> tuple[tuple[int, ...
     whole = {number: np.rint(value / unit).astype(int) for number, value in change.items()}
     return tuple((number, *value.tolist()) for number, value in sorted(whole.items())
                  if np.abs(value).max() > 1)
-
-
-def _exception(to: MagnetBlock, source: MagnetBlock, turn: Floats) -> BlockException:
-    """Return the exception by which a block from another slot is turned by a rotation (3, 3)."""
-    rest = turn @ to.carried_from(source).T
-    axes = rotation_matrix((0.0, 0.0, np.radians(to.angle_deg)))
-    x, y, z = np.degrees(axes.T @ Rotation.from_matrix(rest).as_rotvec()).round(9).tolist()
-    came = None if to is source else source.place
-    return BlockException(ring=to.ring, slot=to.slot, mounted_from=came, rotation_deg=(x, y, z),
-                          **brought_along(to, source))
-
-
-def brought_along(to: MagnetBlock, source: MagnetBlock) -> dict[str, Any]:
-    """Return the keys of an exception for what a block from another slot has with it: its material.
-
-    They are empty if the material is the same in both slots.
-    """
-    names = ("remanence", "recoil_permeability", "recoil_permeability_across")
-    mine, theirs = ([getattr(block, name) for name in names] for block in (to, source))
-    if mine == theirs or not source.remanence:
-        return {}
-    return {"remanence_T": abs(source.remanence), "recoil_permeability": theirs[1],
-            "recoil_permeability_across": theirs[2]}
 
 
 class BlockPutInWronglyEffect(AssemblyEffect):
