@@ -536,6 +536,7 @@ def _built(study: Study) -> Magnet:
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
     _check_external(study)
     _doubt_metres(magnet)
+    _doubt_axis(magnet)
     _doubt_iron(magnet)
     return magnet
 
@@ -546,6 +547,18 @@ def _doubt_metres(magnet: Magnet) -> None:
     if look_like_mm(np.array([[reach, 0.0, 0.0]]))[0]:
         warnings.warn(f"Blocks of {magnet.name} reach {reach:.3g} m from the z axis. Are their "
                       "lengths in mm? Then write 0.01 for 10 mm.", HalbachWarning, stacklevel=3)
+
+
+def _doubt_axis(magnet: Magnet) -> None:
+    """Warn of blocks around another axis than the z axis, about which all is that turns."""
+    x, y, _ = magnet.middle_m
+    if x or y:
+        warnings.warn(
+            f"Blocks of {magnet.name} lie around an axis at x = {x:.4g} and y = {y:.4g} m. "
+            "Multipoles, circles, rolls, turns of rings and radial displacements are about the z "
+            f"axis, which lies beside them: add {-x:.4g} to x_m and {-y:.4g} to y_m of the table, "
+            f"and read its maps by instrument.translation_m = [{-x:.4g}, {-y:.4g}, 0.0].",
+            HalbachWarning, stacklevel=3)
 
 
 def _doubt_iron(magnet: Magnet) -> None:

@@ -76,8 +76,8 @@ FEWEST_READINGS = 20
 probability of 1e-7, with a sd of a third. Of fewer it has to be smaller: of one, it is so in a
 quarter of all maps."""
 
-OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run `halbach-fe check` "
-             "for the noise of the map.")
+OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) `halbach-fe check` "
+             "finds the noise of the map if its points are near enough to each other.")
 """Advice where the noise is stated too large."""
 
 TOO_FAR = 1.3

@@ -266,8 +266,8 @@ def row_order_note(study: Study) -> str:
         ("a memory of the reading before", any(one.memory for one in instruments)),
         ("a drift (drift_T)", any(any(one.drift_T) for one in instruments))) if there]
     return (f"The study has {in_a_row(named)}. It counts on rows in the order in which they "
-            "were read: a table that was sorted or joined makes it wrong. By a "
-            "column time_s a wrong order is seen." if named else "")
+            "were read, unless a column time_s says when: without one, a table that was sorted or "
+            "joined makes it wrong." if named else "")
 
 
 def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:

@@ -206,7 +206,8 @@ def along_the_axis(magnet: Magnet, options: str = "") -> tuple[str, str]:
 
 
 STATE_NOISE = ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "
-               "command finds it.", "halbach-fe check MAP -o DIR")
+               "command finds it, if the map's points are near enough to each other to tell; else "
+               "read the probe repeatedly at one place.", "halbach-fe check MAP -o DIR")
 """The next step, and its command, if readings scatter less than their noise."""
 
 

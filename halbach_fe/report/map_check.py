@@ -85,8 +85,10 @@ def answer(check: MapCheck, in_order: bool = True) -> Answer:
             f"{flux_density(most, 2)}. ")
         return Answer(
             question, f"{verdict(check)} {_noise(check)}",
-            f"No: nothing that the probe may plausibly be explains this map. {worst}Do not "
-            "update a magnet with it.", "Look for rows, axes and units "
+            f"No: nothing that the probe may plausibly be explains this map. {worst}Only if it "
+            f"ends within some spacings of its points ({1e3 * check.spacing_m:.3g} mm) from blocks "
+            "may it be right nevertheless: their field there is none that this fit follows. Else "
+            "do not update a magnet with it.", "Look for rows, axes and units "
             "that are not what the map says, or leave out what is near to magnets and conductors, "
             "and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)

@@ -62,6 +62,9 @@ def test_a_lag_is_named(session, generator):
     assert not row_order_note(found.before.study)
     assert "(lag_m) and a memory" in row_order_note(STUDY.with_(
         instrument={"lag_m": LAG_M, "memory": 0.01}))
+    # times count, however the rows are sorted
+    assert "unless a column time_s says when" in row_order_note(STUDY.with_(
+        instrument__drift_T=(0.0, 0.0, 1e-4)))
     assert "has a drift (drift_T). It" in row_order_note(STUDY.with_(
         instrument={"drift_T": (0.0, 1e-4, 0.0)}))
     # control: without it the update does not agree

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import magpylib
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.errors import StudyError
+import halbach_fe as hf
+from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
@@ -202,3 +206,19 @@ def test_refusals(columns, dimension, said):
     with pytest.raises(StudyError, match=said):
         magnet_of(row("cuboid", **columns), dimension=dimension)
     magnet_of(row("cuboid"), dimension=dimension)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.04, 0.0), (0.3, -0.1)])
+def test_blocks_around_another_axis_than_z_are_doubted(x, y):
+    """Rings that turn do so about the z axis: of a magnet beside it, turns and multipoles were not
+    found, without a word. Control: an axis that lies within the ring.
+    """
+    columns = blocks_table(hf.halbach_ring(
+        blocks=8, inner_radius_m=0.05, outer_radius_m=0.07, length_m=0.03))
+    columns |= {"x_m": [x + each for each in columns["x_m"]],
+                "y_m": [y + each for each in columns["y_m"]]}
+    beside = np.hypot(x, y) > 0.07
+    with pytest.warns(HalbachWarning, match=r"add -0.3 to x_m and 0.1 to y_m") if beside else (
+            contextlib.nullcontext()):
+        magnet = hf.magnet_of_blocks(columns)
+    assert magnet.middle_m == pytest.approx((x, y, 0.0) if beside else (0.0, 0.0, 0.0))

@@ -991,6 +991,8 @@ def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
     failed = answer(replace(CLEAN, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
     assert failed.said.startswith("Failed. ")  # control: it obeys nowhere
     assert "not described by a field without sources within its region" in failed.said
+    # a right map that ended 6 mm from blocks, in steps of 6 mm, was not to be used
+    assert f"({1e3 * CLEAN.spacing_m:.3g} mm) from blocks may it be right" in failed.trust
     everywhere = map_check._reach(GRID, 40 * noise, GRID, NOISE_T)
     assert np.isnan(everywhere.limit_m)
     assert answer(replace(CLEAN, reach=everywhere)).trust.startswith("Only roughly. Everywhere")

@@ -75,6 +75,7 @@ def test_noise_that_is_stated_too_large_is_no_disagreement(campaign, session):
     assert result.disagreement == result.too_near
     assert said.said.startswith("Model and measurement agree better than the stated noise allows")
     assert "halbach-fe check" in said.command
+    assert "else read the probe repeatedly" in said.step  # of coarse maps it does not tell
     assert not said.sound
 
 
