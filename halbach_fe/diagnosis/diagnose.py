@@ -46,6 +46,7 @@ from halbach_fe.diagnosis.linearization import (
     NominalSolver,
     Signatures,
     apply_effects,
+    moves_of,
 )
 from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
@@ -272,6 +273,7 @@ class _Diagnosing:
         self.solver = task.solver or NominalSolver(
             replace(self._subsession("signatures"), progress=None))
         self.signatures: Signatures = {}
+        self.moves: set[Hypothesis] = set()  # of whole blocks, in the model of the last round
         self.first: tuple[InferenceResult, Search] | None = None
         self.position_noise: tuple[PositionNoise, ...] = ()
         self.converged, self.closing = True, False
@@ -367,8 +369,10 @@ class _Diagnosing:
     def _compare(self, number: int) -> None:
         """Compare all effects at the point of the model."""
         self.pace.begin(f"round {number}, effects")
-        if self.update.terms is not None:
-            self.signatures.clear()  # they were at the poses of the last round
+        moves = {effect.hypothesis for effect in moves_of(self.identified)}
+        if self.update.terms is not None or moves != self.moves:
+            self.signatures.clear()  # they were at the poses, or of the blocks, of the last round
+        self.moves = moves
         prior_mean = (self.first[0] if self.first else self.update).prior.mean
         self.search = score_hypotheses(
             Linearization(self.corrected, self.start, self.update, prior_mean, self.campaign,

@@ -13,7 +13,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
-from halbach_fe.diagnosis.effects.blocks import AssemblyEffect
+from halbach_fe.diagnosis.effects.blocks import AssemblyEffect, BlockMissingEffect
 from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -91,6 +91,15 @@ def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study
     return study
 
 
+MOVES = (AssemblyEffect, BlockMissingEffect)
+"""Effects of whole blocks, which are reversed, missing or elsewhere."""
+
+
+def moves_of(identified: Sequence[IdentifiedEffect]) -> list[IdentifiedEffect]:
+    """Return those of some effects after which whole blocks are reversed, missing or elsewhere."""
+    return [one for one in identified if isinstance(one.hypothesis.effect, MOVES)]
+
+
 def amplitude_scale(effect: Effect) -> Floats:
     """Return the prior standard deviations of an effect's parameters and refinements."""
     return np.array([parameter.sd for parameter in (*effect.parameters, *effect.refinements)])
@@ -101,7 +110,9 @@ class Linearization:
     """A point at which all effects are linearized, with some of them in the model already.
 
     The signatures of all effects outside the model are those of the study from which the search
-    started, so that later rounds reuse them.
+    started, so that later rounds reuse them; beside blocks that are reversed, missing or elsewhere
+    in the model, those of that study with these blocks so. In a ring of 12 a reversed one changes
+    what gaps do by a fifth, to which readings are exact.
     """
 
     corrected: Study
@@ -141,8 +152,30 @@ class Linearization:
         return self._scene_of(self.study, self.solver.rough_field)
 
     @cached_property
-    def known(self) -> Signatures:
-        """Signatures that an earlier search has computed for the same study and maps."""
+    def scene_after_moves(self) -> Scene:
+        """That of the study from which the search started, with moves of whole blocks."""
+        return self.campaign.scene(
+            self._study_after_moves, self.solver.rough_field, self.solver.iron_change,
+            self.update.by_block(self.update.prior.mean))
+
+    @cached_property
+    def _study_after_moves(self) -> Study:
+        return self.campaign.with_terms(apply_effects(
+            self.corrected, [*self.start, *moves_of(self.identified)]), self.update.terms)
+
+    def scene_outside(self, effect: Effect) -> Scene:
+        """Return the scene in which the signatures of an effect outside the model are computed."""
+        return self.scene_after_moves if self._is_after_moves(effect) else self.scene_at_start
+
+    def _is_after_moves(self, effect: Effect) -> bool:
+        """Tell whether blocks are moved first: moves of blocks are in place of each other."""
+        return bool(moves_of(self.identified)) and not isinstance(effect, MOVES)
+
+    def _known(self, effect: Effect) -> Signatures:
+        """Return the signatures that an earlier search has computed for the same study and maps."""
+        if self._is_after_moves(effect):
+            return self.solver.signatures(
+                self._study_after_moves, self.update, self.update.prior.mean, self.campaign)
         return self.solver.signatures(self.study, self.update, self.prior_mean, self.campaign)
 
     @cached_property
@@ -171,15 +204,17 @@ class Linearization:
 
     def stored(self, hypothesis: Hypothesis) -> Floats | None:
         """Return the whitened signature (rows, k) of a hypothesis outside the model, if known."""
-        signature = self.signatures.get(hypothesis.key, self.known.get(hypothesis.key))
+        signature = self.signatures.get(
+            hypothesis.key, self._known(hypothesis.effect).get(hypothesis.key))
         if signature is not None:
             self.signatures[hypothesis.key] = signature
         return signature
 
     def exact(self, hypothesis: Hypothesis) -> Floats:
         """Compute the whitened signature (rows, k) of a hypothesis outside the model."""
-        signature = self._by_response(hypothesis, self.scene_at_start)
-        self.known[hypothesis.key] = self.signatures[hypothesis.key] = signature
+        signature = self._by_response(hypothesis, self.scene_outside(hypothesis.effect))
+        self._known(hypothesis.effect)[hypothesis.key] = signature
+        self.signatures[hypothesis.key] = signature
         return signature
 
     def rough(self, hypothesis: Hypothesis, is_over: bool) -> Floats | None:
@@ -189,7 +224,7 @@ class Linearization:
         """
         key = f"{hypothesis.effect.name}, roughly", hypothesis.place
         if key not in self.signatures and not is_over:
-            fields = self.scene_at_start.rough_signature(hypothesis)
+            fields = self.scene_outside(hypothesis.effect).rough_signature(hypothesis)
             if fields is not None:
                 self.signatures[key] = self.training.shown(fields)
         return self.signatures.get(key)
@@ -222,7 +257,8 @@ class Linearization:
 
     def refined(self, hypothesis: Hypothesis) -> Floats:
         """Compute the whitened signature (rows, k) at a place that `_improved_place` has found."""
-        signature = self.training.shown(self.scene_at_start.signature(hypothesis))
+        signature = self.training.shown(
+            self.scene_outside(hypothesis.effect).signature(hypothesis))
         self.signatures[hypothesis.key] = signature
         return signature
 

@@ -236,7 +236,7 @@ class _Comparison:
             effect = grid[0].hypothesis.effect
 
             def slopes(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
-                return self.point.training.shown(self.point.scene_at_start.derivative(
+                return self.point.training.shown(self.point.scene_outside(effect).derivative(
                     Hypothesis(effect, place), amounts))
 
             better = _improved_place(
