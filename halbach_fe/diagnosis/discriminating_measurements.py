@@ -219,8 +219,9 @@ def candidate_measurements(
     own = np.array(diagnosis.before.maps) == name if name else slice(None)
     places = observation.positions if name is None else observation.places[own]
     sigma = _point_sigma(diagnosis, own)
-    centre = NominalFields(study, np.zeros((1, 3)), np.zeros(1),
-                           lambda other: np.zeros((1, 3))).field[0]
+    magnet = build_magnet(study)
+    middle = np.array([[0.0, 0.0, magnet.middle_z_m]])
+    centre = NominalFields(study, middle, np.zeros(1), lambda other: np.zeros((1, 3))).field[0]
     size = float(np.linalg.norm(centre))
     found = [
         CandidateMeasurement(
@@ -229,11 +230,10 @@ def candidate_measurements(
         CandidateMeasurement(
             "probe_reversed", f"{same} with the probe turned by 180° about x",
             replace(present, probe_rotation=present.probe_rotation @ np.diag([1.0, -1.0, -1.0])))]
-    magnet = build_magnet(study)
-    if size > nmr_min_field_t and not magnet.contains(np.zeros((1, 3))).any():
+    if size > nmr_min_field_t and not magnet.contains(middle).any():
         found.append(CandidateMeasurement(
             "nmr_point", "one NMR reading in the middle of the bore", ProposedScan(
-                np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
+                middle, np.zeros(1), sparse.csr_array(centre[None] / size),
                 independent_noise(np.array([nmr_relative_sd * size])), np.eye(3), np.eye(3),
                 mapped=False)))
     radii = np.unique(np.round(radii_of(places), 6))
@@ -246,8 +246,8 @@ def candidate_measurements(
     if study.dimension == 3:
         half, reach = magnet.array_half_length, magnet.array_outer_radius
         farthest = min(4 * reach, 0.4 * (boundary_half_length(magnet, "extruded") - half))
-        beyond = [side * (half + farthest * step) for side in (-1, 1)
-                  for step in np.linspace(0.2, 1, 5)]
+        beyond = [end + side * farthest * step for end, side in zip(
+            magnet.array_ends, (-1, 1), strict=True) for step in np.linspace(0.2, 1, 5)]
         others.append(("far_field", f"points up to {1e3 * farthest:.0f} mm beyond the ends",
                        np.vstack([_circle(0.5 * reach, z, 4) for z in beyond])))
     in_air = [(which, title, points[~magnet.contains(points)]) for which, title, points in others]
