@@ -300,7 +300,6 @@ def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     has the instruments that were found.
     """
     from halbach_fe.inference.infer import observation_of
-    from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
     from halbach_fe.measurement.field_map import refuse_total_field
 
     study = magnet.study
@@ -318,11 +317,9 @@ def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
         from halbach_fe.inference.mcmc import check_sampling
 
         check_sampling(magnet)
-        refuse_open_instruments(study, "--samples")
         for one in [validation_map, *(data.values() if isinstance(data, dict) else [data])]:
             if one is not None:
                 refuse_total_field(one, "--samples")
-        refuse_uncertain(study, "--samples")
     if arguments.dry_run:
         from halbach_fe.response.resource_estimate import estimate_infer
 

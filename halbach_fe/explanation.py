@@ -15,6 +15,7 @@ import xarray as xr
 from halbach_fe.api import diagnose
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.pace import Say, quiet
+from halbach_fe.diagnosis.map_errors import blocks_of
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
@@ -22,7 +23,7 @@ from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.field_map import directed, is_total_field, is_undirected, taking_arrays
+from halbach_fe.measurement.field_map import is_total_field, taking_arrays
 from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
 from halbach_fe.measurement.suspect_rows import check_total
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
@@ -196,8 +197,6 @@ class _InMemory:
         answer = registration.answer(self.poses, assumed=self.magnet.study.instrument)
         if registration.STUDY_FILE in answer.command:
             self.magnet = build_magnet(best.study)
-            if is_undirected(self.data):
-                self.data = directed(self.data, best.component)
         return self._answered("registered", answer)
 
     def diagnose(self) -> bool:
@@ -205,5 +204,6 @@ class _InMemory:
                                   self.blocks, say=self.say)
         answer = diagnosis_answer.answer(self.diagnosis)
         if answer.changes_study:
+            self.blocks = blocks_of(self.blocks, self.magnet.study, self.diagnosis.study)
             self.magnet = build_magnet(self.diagnosis.study)
         return self._answered("diagnosed", answer) and answer.changes_study

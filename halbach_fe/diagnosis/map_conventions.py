@@ -195,7 +195,7 @@ def _rotated_magnet(study: Study, angle_deg: float) -> Study:
 
     array, external = study.array, study.external
     exceptions = tuple(exception.with_(
-        shift_m=around(exception.shift_m),
+        shift_m=around(exception.shift_m), tilt_deg=around((*exception.tilt_deg, 0.0))[:2],
         magnetization_angle_deg=None if exception.magnetization_angle_deg is None
         else _wrapped(exception.magnetization_angle_deg + angle_deg))
         for exception in array.exceptions)

@@ -83,7 +83,7 @@ class OpenTerms:
             shifts = [f"{one.name}.stage_shift_{axis}_m" for axis in COMPONENTS]
             sd = np.append(prior_sd(one.study.instrument_sd), one.shift_sd_m)
             if is_total_field(one.data):
-                terms, sd = _of_total_field(terms, sd)
+                terms, sd = of_total_field(terms, sd)
             for name, value in zip(terms + shifts, sd.tolist(), strict=True):
                 if value > 0:
                     known.setdefault(name, value)
@@ -184,13 +184,13 @@ class OpenTerms:
         return readings.observation.read(np.concatenate(found).T.reshape(len(self), -1, 3)).T
 
 
-def _of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
+def of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
     """Return names and standard deviations of the terms of a probe of |B|.
 
     Its gain, offset and drift are one number each, and it has neither axes nor several sensors.
     """
     found, sd = terms.copy(), sd.copy()
-    for number, name in enumerate(NAMES):
+    for number, name in enumerate(NAMES[:len(terms)]):
         kind = name.split("_", 1)[0]
         if kind in ("gain", "offset", "drift"):
             unit = "" if kind == "gain" else "_T"

@@ -31,6 +31,7 @@ from halbach_fe.core.installation import code_digest
 from halbach_fe.core.untrusted import read_hdf5, with_checksum
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
+from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -189,15 +190,18 @@ def sample_posterior(
 
 
 def check_sampling(magnet: Magnet) -> None:
-    """Refuse a magnet whose non-linear model needs a mesh that it cannot have, or that stands
-    beside others, whose blocks deviate too and are no parameters of the model.
+    """Refuse a magnet whose non-linear model needs a mesh that it cannot have, or of which more is
+    open than the blocks, which alone are parameters of the model: an instrument, amplitudes, or the
+    blocks of neighbours.
 
     Raises
     ------
     StudyError
         If a 3D array does not consist of equal rings, which the mesh of the model takes them to be,
-        or the study has neighbours.
+        or the study has neighbours, open instruments or uncertain amplitudes.
     """
+    refuse_open_instruments(magnet.study, "--samples")
+    refuse_uncertain(magnet.study, "--samples")
     if magnet.external.neighbours:
         raise StudyError(must_be(
             "`external.neighbours`", f"study {magnet.name}", "left out, to sample the posterior "

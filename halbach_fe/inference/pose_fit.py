@@ -26,7 +26,7 @@ from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, m
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.instrument_fit import shown_less_read
+from halbach_fe.inference.instrument_fit import of_total_field, shown_less_read
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
 from halbach_fe.inference.pose_search import (
     LONGEST_M,
@@ -468,7 +468,10 @@ class PoseFit:
     @cached_property
     def _named(self) -> list[tuple[str, str]]:
         """Words and unit of all parameters, see `halbach_fe.measurement.doubted_terms.Term`."""
-        named = [words_of(name) for name in NAMES[STEADY]]
+        names = list(NAMES[STEADY])
+        if self.total:
+            names, _ = of_total_field(names, np.zeros(len(names)))
+        named = [words_of(name) for name in names]
         for each in self.open:
             unit = each.key.rpartition("_")[2]
             named.append((f"`{each.key}`", unit if unit in UNITS else ""))
@@ -482,6 +485,7 @@ class PoseFit:
         """
         exact = self.instrument(pose, np.append(np.zeros(PROBE), values[PROBE:]))
         expected = self._field(values)(self._middle(pose, values)) @ sensor_matrix(exact).T
+        expected = self._shown(expected, unit_vectors(expected))
         both = self.readings[self.training], expected[self.training]
         return factor_of(*both), likeness_of(*both)
 

@@ -264,7 +264,8 @@ def row_order_note(study: Study) -> str:
     named = [what for what, there in (
         ("a lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
         ("a memory of the reading before", any(one.memory for one in instruments)),
-        ("a drift (drift_T)", any(any(one.drift_T) for one in instruments))) if there]
+        ("a drift (drift_T)", any(any(one.drift_T) for one in instruments)),
+        ("a drift of the gain (gain_drift)", any(one.gain_drift for one in instruments))) if there]
     return (f"The study has {in_a_row(named)}. It counts on rows in the order in which they "
             "were read, unless a column time_s says when: without one, a table that was sorted or "
             "joined makes it wrong." if named else "")
@@ -303,8 +304,8 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
 
 
 def field_read(instrument: Instrument, data: xr.Dataset) -> Floats:
-    """Return B (n, 3) in T of a map, along the magnet's axes, by the law of the sensors; NaN where
-    a component was not measured.
+    """Return B (n, 3) in T of a map, along the magnet's axes, by the law of the sensors; all three
+    components are NaN where one was not measured.
     """
     values = remove_nonlinear_part(instrument, data)
     return np.asarray(np.linalg.solve(sensor_matrix(instrument), values.T).T)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import magpylib
 import numpy as np
 import pytest
 
 import halbach_fe as hf
+from halbach_fe import explanation
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, MeasurementError
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.cost import estimate_diagnosis
@@ -355,3 +359,18 @@ def test_only_what_leads_back_and_has_rivals_is_given_up():
     assert dropped_with_rivals([nothing, one], [first], [first]) == set()  # is at rest
     itself = identified("z_scale", 3.0, "z_scale")  # at another place
     assert dropped_with_rivals([nothing], [itself], []) == set()
+
+
+def test_blocks_of_another_number_of_rings_lose_their_places(generator, monkeypatch):
+    """In the update after a diagnosis that has corrected it, as in the diagnosis itself."""
+    table = table_of(STUDY, drawn(STUDY, generator), generator)
+    table = replace(table, type=("block",) * len(table))
+    for rings in (1 + STUDY.array.rings, STUDY.array.rings):  # the second one is the control
+        steps = explanation._InMemory(
+            build_magnet(STUDY), None, explanation.NOT_KEPT, table, lambda text: None)
+        found = SimpleNamespace(study=STUDY.with_(array__rings=rings))
+        monkeypatch.setattr(explanation, "diagnose", lambda *_, found=found, **__: found)
+        monkeypatch.setattr(explanation.diagnosis_answer, "answer", lambda _: SimpleNamespace(
+            changes_study=True, said="", trust="", sound=True))
+        assert steps.diagnose()
+        assert steps.blocks.ring.any() == (rings == STUDY.array.rings)

@@ -216,6 +216,13 @@ def test_options_fit_the_study(case):
     weak = replace(diagnosis.before, magnet=diagnosis.before.magnet.with_(array=array))
     names = {one.name for one in candidate_measurements(replace(diagnosis, before=weak), data)}
     assert set(found) - names == {"nmr_point"}  # too weak for it
+    away = diagnosis.before.magnet.with_(array__rings=1, array__ring=[
+        {"ring_length_m": 0.16, "z_m": 0.5}])
+    found = {one.name: one.scan for one in candidate_measurements(
+        replace(diagnosis, before=replace(diagnosis.before, magnet=away)), data)}
+    np.testing.assert_allclose(found["nmr_point"].points, [[0.0, 0.0, 0.5]])
+    beyond = np.abs(found["far_field"].points[:, 2] - 0.5) - 0.08
+    assert 0 < beyond.min() < 0.2 * beyond.max() + 1e-9
 
 
 def test_no_reading_is_proposed_in_iron(case):

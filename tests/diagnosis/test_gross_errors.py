@@ -9,6 +9,7 @@ import halbach_fe as hf
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
 from halbach_fe.diagnosis.map_conventions import array_variants
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
@@ -136,6 +137,21 @@ def test_a_magnet_beside_a_box_of_iron_is_not_turned():
         study = STUDY.with_(iron={"relative_permeability": 100.0, "bodies": [body]})
         names = {one.name for one in array_variants(study)}
         assert ("rotated_by_one_block" in names) == turned
+
+
+def test_a_magnet_is_turned_with_what_exceptions_say_of_it():
+    """A ring that is tilted, displaced or of another magnetization, with its direction."""
+    study = STUDY.with_(array__exceptions=[
+        {"ring": 1, "tilt_deg": (0.5, 0.1), "shift_m": (1e-3, 0.0, 0.0)},
+        {"slot": 2, "magnetization_angle_deg": 20.0}])
+    turn = next(one for one in array_variants(study) if one.name == "rotated_by_one_block")
+    before, after = (build_magnet(each).blocks for each in (study, turn.change(study)))
+    move = rotation_about_z(np.radians(after[0].angle_deg - before[0].angle_deg))
+    assert move[0, 1] != 0
+    for old, new in zip(before, after, strict=True):
+        for key in ("mounted_middle", "polarization", "rotation_rad"):
+            np.testing.assert_allclose(
+                getattr(new, key), move @ np.array(getattr(old, key)), atol=1e-9)
 
 
 @pytest.mark.parametrize(("case", "keys"), {

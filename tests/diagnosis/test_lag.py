@@ -67,6 +67,7 @@ def test_a_lag_is_named(session, generator):
         instrument__drift_T=(0.0, 0.0, 1e-4)))
     assert "has a drift (drift_T). It" in row_order_note(STUDY.with_(
         instrument={"drift_T": (0.0, 1e-4, 0.0)}))
+    assert "(gain_drift). It" in row_order_note(STUDY.with_(instrument={"gain_drift": 0.01}))
     # control: without it the update does not agree
     assert found.before.prior_conflict > found.before.conflict_limit
 

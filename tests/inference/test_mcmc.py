@@ -268,15 +268,20 @@ sigma_T = 1e-4
     assert "closed form" in capsys.readouterr().err
 
 
-def test_chains_beside_neighbours_are_refused():
-    """Their blocks deviate too, which an update without chains estimates and the chains do not."""
+@pytest.mark.parametrize(("more", "said"), [
+    ({"external": {"neighbours": [{"z_m": 0.3}]}}, r"external\.neighbours.*Leave --samples out"),
+    ({"instrument_sd": {"gain": 0.01}}, "instrument_sd.*left out, for --samples"),
+    ({"external": {"background_T": [0.0, 1e-4, 0.0]}, "uncertain": [
+        {"name": "field", "sd": 1e-4, "change": {"external.background_T[2]": 1.0}}]},
+     "uncertain.*left out, for --samples")])
+def test_chains_have_no_parameters_but_blocks(more, said):
+    """An update without chains estimates the others, blocks of neighbours too: chains do not."""
     table = tomllib.loads(STUDY_FILE)
     table |= {"dimension": 3, "array": table["array"] | {"ring_length_m": 0.1},
               "iron_ring": table["iron_ring"] | {"length_m": 0.1}}
     mcmc.check_sampling(build_magnet(parse_study(table)))  # the control
-    with pytest.raises(StudyError, match=r"external\.neighbours.*Leave --samples out"):
-        mcmc.check_sampling(build_magnet(parse_study(table | {
-            "external": {"neighbours": [{"z_m": 0.3}]}})))
+    with pytest.raises(StudyError, match=said):
+        mcmc.check_sampling(build_magnet(parse_study(table | more)))
 
 
 @pytest.mark.parametrize("small_disk", [64], indirect=True)

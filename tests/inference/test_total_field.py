@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import re
+from types import SimpleNamespace
 
 import magpylib
 import numpy as np
@@ -15,6 +16,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.inference.registration import register
 from halbach_fe.inference.storage import write_inference
@@ -272,14 +274,20 @@ def test_components_and_magnitude_update_together(generator, session):
 
 
 def test_a_map_of_the_magnitude_is_registered(generator, session):
-    """Pose, gain and offset by |B| alone, from no first guess; the sign stays open, and is said."""
-    turn, shift = Rotation.from_rotvec([0.01, -0.02, 0.015]), np.array([1e-3, -2e-3, 5e-3])
+    """Pose, gain and offset by |B| alone, from no first guess; the sign stays open, and is said.
+
+    A quarter turn puts the field along y of the map, and all of it is compared with the readings.
+    """
+    turn = Rotation.from_rotvec([0.01, -0.02, 0.015]) * Rotation.from_euler("z", np.pi / 2)
+    shift = np.array([1e-3, -2e-3, 5e-3])
     places = turn.apply(POINTS) + shift
     size = 1.002 * np.linalg.norm(truth(1, 1)[0].getB(places), axis=1) + 3e-4
     data = total_field_map(POINTS, size + NOISE_T * generator.standard_normal(len(size)))
     found = register(build_magnet(study_of(1)), data, session, most=1)
     best = found[0]
     assert best.explains
+    assert best.factor == pytest.approx(1.002, abs=0.01)  # blocks have 1 % less or more together
+    assert best.likeness > 0.9999
     middle = turn.apply((POINTS.max(axis=0) + POINTS.min(axis=0)) / 2) + shift
     own = Rotation.from_rotvec(best.instrument.rotation_rad)
     # half turns leave |B| of the nominal dipole as it is
@@ -294,6 +302,12 @@ def test_a_map_of_the_magnitude_is_registered(generator, session):
     assert abs(offset[0] - 3e-4) < 4 * best.probe.offset_T
     assert not best.instrument.crosstalk or not any(best.instrument.crosstalk.values())
     assert "if the field is reversed everywhere" in sentences(found)[0]
+
+
+@pytest.mark.parametrize(("total", "said"), [(True, "gain of |B|"), (False, "gain of Bx")])
+def test_a_doubted_probe_of_the_magnitude_has_no_axis(total, said):
+    named = PoseFit._named.func(SimpleNamespace(total=total, open=()))
+    assert next(words for words, _ in named if words.startswith("gain")) == said
 
 
 def test_a_map_of_another_magnet_is_not_explained(generator, session):
