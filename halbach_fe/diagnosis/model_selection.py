@@ -304,16 +304,30 @@ def _exchanged(
     """Put likelier candidates in place of chosen ones, given the other chosen ones.
 
     What came first had to explain what others explain now: a block that was displaced as far as a
-    turned map looked like it may be a weak one.
+    turned map looked like it may be a weak one. What is about as likely as a chosen one may make
+    others likelier beside it: those of the exchanges that are likeliest together are returned.
     """
-    chosen = list(chosen)
-    for index, number in enumerate(chosen):
-        odds = odds_beside(evidence, candidates, [k for k in chosen if k != number], prior,
-                           excluded)
-        best = int(np.argmax(odds))
-        if odds[best] > odds[number] + INDISTINGUISHABLE_LOG_EVIDENCE:
-            chosen[index] = best
-    return chosen
+    def likelier(chosen: Sequence[int]) -> tuple[int, ...]:
+        chosen = list(chosen)
+        for index, number in enumerate(chosen):
+            odds = odds_beside(evidence, candidates, [k for k in chosen if k != number], prior,
+                               excluded)
+            best = int(np.argmax(odds))
+            if odds[best] > odds[number] + INDISTINGUISHABLE_LOG_EVIDENCE:
+                chosen[index] = best
+        return tuple(chosen)
+
+    found = {likelier(chosen)}
+    for one in tuple(found) if len(chosen) > 1 else ():
+        for index, number in enumerate(one):
+            others = [*one[:index], *one[index + 1:]]
+            odds = odds_beside(evidence, candidates, others, prior, excluded)
+            odds[number], least = -np.inf, odds[number] - INDISTINGUISHABLE_LOG_EVIDENCE
+            rival = int(np.argmax(odds))
+            if odds[rival] > least:
+                found.add(likelier([*one[:index], rival, *one[index + 1:]]))
+    return list(max(sorted(found), key=lambda one: log_evidence(
+        evidence, [candidates[number] for number in one]) + prior[list(one)].sum()))
 
 
 def without_needless(

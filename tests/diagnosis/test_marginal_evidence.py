@@ -232,6 +232,23 @@ def test_an_effect_competes_by_its_parts():
     assert np.abs(with_wide_priors(evidence, [effect]).fit(effect.free).mean).min() > 0.5
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.3])
+def test_two_effects_give_way_to_two_that_are_likelier_together(generator, apart):
+    """A background with an amplitude beside that of an offset, and a non-linearity that is with it
+    what a gain is: neither gives way alone. Control: a background that is there stays.
+    """
+    offset, beside, nonlinearity = 2.0 * generator.standard_normal((3, 400))
+    gain = nonlinearity + 0.3 * beside
+    signatures = np.column_stack([offset, beside, nonlinearity, gain])
+    residual = offset + gain + apart * beside + generator.standard_normal(400)
+    candidates = [Candidate("background", "", (0, 1), parts=((0,), (1,), (0, 1))),
+                  Candidate("nonlinearity", "", (2,)), Candidate("offset", "", (0,)),
+                  Candidate("gain", "", (3,))]
+    evidence = Marginal.of(np.zeros((400, 1))).evidence(signatures, residual)
+    found = {one.candidate.effect for one in select_effects(evidence, candidates)}
+    assert found == {"background" if apart else "offset", "gain"}
+
+
 @pytest.mark.parametrize(("amplitudes", "named"), [((0.0, 0, 1.0), False), ((0.5, 0, 1.0), True)])
 def test_what_effects_share_names_none_of_them(amplitudes, named):
     """A gap with a common shift: the shift alone is no gap, and its own effect is named."""
