@@ -16,7 +16,7 @@ from halbach_fe.solver.exact_block_field import coil_field, dipole_field, neighb
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.separate_blocks import external_acts
 from halbach_fe.study.external import AnyCoil, Neighbour, PointDipole
-from halbach_fe.study.iron import FroehlichKennellyCurve, IronRing, SteelCurve
+from halbach_fe.study.iron import FroehlichKennellyCurve, Iron, IronRing, IronTube, SteelCurve
 from halbach_fe.study.model import Study, iron_of
 
 
@@ -44,8 +44,8 @@ STEP_M = 5e-4
 class NeighbourMagnetEffect(Effect):
     """A magnet like this one stands on the same axis.
 
-    A place is the approximate position of its centre along z, on either side. The refinements
-    adjust its strength and its distance.
+    A place is approximately how far along z its centre is from this one's, on either side. The
+    refinements adjust its strength and its distance.
     """
 
     name = "neighbour_magnet"
@@ -60,7 +60,7 @@ class NeighbourMagnetEffect(Effect):
         gaps_m = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
         if study.dimension == 2:
             return []
-        length = 2 * build_magnet(study).array_half_length
+        length = float(np.ptp(build_magnet(study).array_ends))
         return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in gaps_m]
 
     def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
@@ -118,13 +118,14 @@ class FerromagneticObjectEffect(Effect):
         if study.dimension == 2:
             return []
         magnet = build_magnet(study)
-        half, outer = magnet.array_half_length, magnet.array_outer_radius
+        (low, high), outer = magnet.array_ends, magnet.array_outer_radius
         radii = [magnet.bore_radius, outer, 1.4 * outer]
-        heights = [side * (half + beyond) for side in (-1, 1) for beyond in beyond_m]
+        heights = [*(low - beyond for beyond in beyond_m), *(high + beyond for beyond in beyond_m)]
         ends = [(r, z) for r in radii for z in heights]
-        outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
+        outside = [(1.2 * outer, z) for z in np.linspace(low, high, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
-        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
+        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights
+                if not low - 0.1 <= z <= high + 0.1]
         found = axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
                         for r, z in ends + outside for a in angles]
         inside = magnet.contains(np.array([place.at_m for place in found]))
@@ -278,16 +279,22 @@ class IronRingEffect(Effect):
         inner, outer = place.at_m
         farther, thicker, higher, more = values[1:] or (0.0, 0.0, 0.0, 0.0)
         thickness = max(outer - inner + thicker, thinnest_m)
-        inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
+        magnet = build_magnet(study)
+        inner = max(inner + farther, magnet.array_outer_radius + clearance_m)
         # mild steels have polarizations of 2.0 to 2.15 T and permeabilities of 200 to 3000 where
         # they are not saturated; cast iron has 1.6 T
         lowest_T, typical_T, highest_T = 1.2, 2.0, 2.5
         least, typical = 0.1, 1000.0
+        curve = FroehlichKennellyCurve(
+            kind="froehlich_kennelly",
+            initial_relative_permeability=typical * max(1 + more, least),
+            saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))
+        if magnet.middle_z_m:  # where no `iron_ring` is
+            return study.with_(iron=Iron(curve=curve, bodies=(IronTube(
+                kind="tube", inner_radius_m=inner, outer_radius_m=inner + thickness,
+                length_m=float(np.ptp(magnet.array_ends)), z_m=magnet.middle_z_m),)))
         return study.with_(iron_ring=IronRing(
-            inner_radius_m=inner, outer_radius_m=inner + thickness, curve=FroehlichKennellyCurve(
-                kind="froehlich_kennelly",
-                initial_relative_permeability=typical * max(1 + more, least),
-                saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))))
+            inner_radius_m=inner, outer_radius_m=inner + thickness, curve=curve))
 
 
 STEEL = "aisi_1010"
