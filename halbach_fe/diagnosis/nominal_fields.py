@@ -179,8 +179,9 @@ class NominalFields:
     ) -> Floats:
         """Return the derivative of B (n, 3) in T/rad when block number ``block`` turns.
 
-        The rotation axis has the direction ``axis`` (3,), a unit vector, and passes through the
-        point ``centre`` (3,) in m. The magnetization turns with the block.
+        The rotation axis has the direction ``axis`` (3,), and passes through the point ``centre``
+        (3,) in m. The derivative is per unit of the factor by which ``axis`` is multiplied. The
+        magnetization turns with the block.
         """
         around = np.cross(axis, self.points - centre)
         return np.asarray(np.cross(axis, self.block_fields[block])

@@ -131,6 +131,37 @@ def test_blocks_are_moved_as_they_are(exceptions):
                     properties(before.blocks[source])[1:], rel=1e-9)
 
 
+EXCEPTIONAL = SPACED.with_(array__exceptions=[
+    {"magnetization_gradient": 0.02}, {"ring": 2, "twist_deg": 0.5, "tilt_deg": (0.2, 0.1)},
+    {"ring": 3, "inner_corner_loss": 0.1}, {"ring": 1, "slot": 1, "magnetization_factor": -0.8},
+    {"ring": 2, "slot": 1, "displacement_m": (2e-3, 1e-3, 2e-3), "rotation_deg": (180, 1, 2),
+     "magnetization_gradient": 0.05},
+    {"ring": 2, "slot": 2, "magnetization_angle_deg": 77.0},
+    {"ring": 3, "slot": 1, "mounted_from": (1, 2), "magnetization_factor": 0.9},
+    {"ring": 3, "slot": 2, "recoil_permeability_across": 1.1}])
+IN_VACUUM = sorted(name for name, effect in EFFECTS.items() if effect.kind == "field" and not (
+    effect.is_solved or effect.applied_in_full or name == "coil_current"))
+
+
+@pytest.mark.parametrize("name", IN_VACUUM)
+def test_signatures_are_derivatives_of_a_study_with_exceptions(name):
+    """What effects do to blocks that are not as the array says already, at amplitude 0 nothing."""
+    effect, study = EFFECTS[name], EXCEPTIONAL
+    nominal = NominalFields(study, POINTS, TIME, None)
+    places = effect.places(study)
+    for place in [one for one in places if one.slot in (1, 2)] or places[:3]:
+        signature = effect.signature(nominal, place)
+        nothing = [0.0] * len(effect.parameters)
+        assert shown(effect.apply(study, place, nothing)) == pytest.approx(shown(study), abs=1e-12)
+        for number, parameter in enumerate(effect.parameters):
+            step = 0.01 * parameter.sd
+            values = (step * np.eye(len(nothing))[number]).tolist()
+            change = (shown(effect.apply(study, place, values)) - shown(study)) / step
+            # what is not linear: 1.1e-2 of the step of 1 mm by a length, else 1e-3 at most
+            np.testing.assert_allclose(change, signature[number], atol=np.abs(signature).max() * (
+                1.5e-2 if name == "length" else 3e-3))
+
+
 def test_effects_of_a_block_are_those_of_the_one_that_is_moved_there():
     """In which order ever they were found: one that was weaker before is another one's loss."""
     place = EFFECTS["blocks_swapped"].places(SPACED)[1]
@@ -385,6 +416,58 @@ def test_only_blocks_of_four_edges_have_corners(magnet, uneven):
         assert bool(places) == uneven
         for place in places[:1]:
             build_magnet(EFFECTS[name].apply(study, place, [0.01]))
+
+
+AWAY = parse_study(changed(DIPOLE, dimension=3, array__recoil_permeability=1.0, array__ring=[
+    {"ring_length_m": 0.1, "z_m": 0.0}]))
+"""One ring, which lies elsewhere along z in the test below."""
+
+
+@pytest.mark.parametrize("name", ["neighbour_magnet", "ferromagnetic_object", "iron_ring"])
+def test_what_is_beside_a_magnet_is_where_the_magnet_is(name):
+    """Of a magnet 0.5 m away from z = 0, too."""
+    effect, found = EFFECTS[name], []
+    for z in (0.0, 0.5):
+        study = AWAY.with_(array__ring=[{"ring_length_m": 0.1, "z_m": z}])
+        place = effect.places(study)[0]
+        magnet = build_magnet(effect.apply(study, place, [1.0] * len(effect.parameters)))
+        heights = [*(np.ravel(place.at_m)[-1:] if name == "ferromagnetic_object" else []),
+                   *(limit for body in magnet.iron for limit in (body.z_min, body.z_max)),
+                   *(one.z_m + z for one in magnet.external.neighbours)]
+        found.append(np.array(heights) - z)
+    assert len(found[0])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
+PERMEABLE = {"recoil_permeability": 1.05, "recoil_permeability_across": 1.15}
+
+
+@pytest.mark.parametrize(("array", "along", "across"), [
+    (PERMEABLE, 1.07, 1.15), ({"recoil_permeability": 1.05}, 1.07, 1.07),
+    ({"ring": [PERMEABLE] * 4}, 1.07, 1.15), ({"exceptions": [PERMEABLE]}, 1.07, 1.15),
+    ({"exceptions": [{"recoil_permeability": 1.05}]}, 1.07, 1.07)])
+def test_permeabilities_along_and_across_are_two(array, along, across):
+    """Whichever table of a study states them."""
+    study = STUDY.with_(**{f"array__{key}": value for key, value in array.items()})
+    for name, expected in (("recoil_permeability", (along, across)),
+                           ("recoil_permeability_across", (1.05, across + (
+                               0.0 if along == across else 0.02)))):
+        for block in build_magnet(EFFECTS[name].apply(study, Place(), [0.02])).blocks:
+            assert (block.recoil_permeability, block.recoil_permeability_across) == (
+                pytest.approx(expected))
+
+
+@pytest.mark.parametrize(("keys", "rate"), [
+    ({}, -1e-3), ({"array__material": "YX20", "array__remanence_T": 0.915}, -4e-4),  # SmCo5
+    ({"demagnetization": {
+        "intrinsic_coercivity_A_per_m": 2e6, "coercivity_coefficient_per_K": -2e-3,
+        "remanence_coefficient_per_K": -3.5e-4}}, -3.5e-4),
+    ({"prior": {"temperature_coefficient_per_K": -4e-4, "reference_temperature_C": 20.0}}, -4e-4)])
+def test_a_temperature_acts_as_the_study_says(keys, rate):
+    study = STUDY.with_(**keys)
+    warmer = EFFECTS["temperature"].apply(study, Place(), [30.0])
+    assert build_magnet(warmer).blocks[0].remanence == pytest.approx(
+        (1 + 30 * rate) * build_magnet(study).blocks[0].remanence)
 
 
 def test_iron_of_another_permeability():

@@ -10,12 +10,13 @@ import pytest
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter
-from halbach_fe.diagnosis.effects.material import COERCIVITIES, STATED, KneeEffect
+from halbach_fe.diagnosis.effects.material import COERCIVITIES, STATED, KneeEffect, _mean_losses
 from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import with_short_steps
 from halbach_fe.diagnosis.summary import diagnosis_summary
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.materials import MU_0
@@ -72,6 +73,20 @@ def test_a_knee_is_named_with_its_parameters(session, generator):
     tried = [candidate.place for candidate in found.candidates if candidate.effect == "knee"]
     assert 0 < len(tried) < len(COERCIVITIES)
     assert "knee" not in {candidate.effect for candidate in clean.candidates}
+
+
+def test_a_block_upside_down_loses_what_one_of_the_opposite_axis_does():
+    """By the cheap estimate that says which coercivities are tried."""
+    knee = KneeEffect()
+    found, (x, y, _) = [], build_magnet(STUDY).blocks[1].easy_axis
+    opposite = float(np.degrees(np.arctan2(-y, -x)))
+    for exception in ({"magnetization_factor": -1.0}, {"magnetization_angle_deg": opposite}):
+        study = STUDY.with_(array__exceptions=[{"slot": 2, **exception}])
+        materials = [knee.apply(study, place, [1.0]).demagnetization
+                     for place in knee.places(study)]
+        found.append(_mean_losses(study, materials))
+    np.testing.assert_allclose(found[0], found[1], atol=1e-12)
+    assert np.abs(found[0][0, 3:6]).max() > 0.1  # of this very block, in T
 
 
 def test_where_it_is_looked_for():

@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.effects.base import (
     each_block,
     each_ring,
     place_of,
+    together,
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -117,9 +118,16 @@ class MagnetizationGradientEffect(Effect):
         return np.asarray(per_unit[blocks_at(nominal.magnet, place)].sum(axis=0))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        return with_exceptions(study, [BlockException(
-            ring=place.ring or None, slot=place.slot or None,
-            magnetization_gradient=float(values[0]))])
+        return _more_uneven(study, place, values[0], "magnetization_gradient", "gradient")
+
+
+def _more_uneven(study: Study, place: Place, change: float, key: str, name: str) -> Study:
+    """Return the study with more of what a key of exceptions says, a field of blocks has."""
+    magnet = build_magnet(study)
+    present = {number: getattr(magnet.blocks[number], name) for number in blocks_at(magnet, place)}
+    return with_exceptions(study, [
+        BlockException.model_validate(where | {key: value + float(change)})
+        for where, value in together(magnet.blocks, present)])
 
 
 class CornersDemagnetizedEffect(Effect):
@@ -140,13 +148,7 @@ class CornersDemagnetizedEffect(Effect):
         return (nominal.fields_of(lost) - nominal.block_fields).sum(axis=0)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        # the last exception that applies to all blocks sets the loss the study has already
-        present = next((exception.inner_corner_loss
-                        for exception in reversed(study.array.exceptions)
-                        if exception.inner_corner_loss is not None
-                        and not (exception.ring or exception.slot)), 0.0)
-        return with_exceptions(study, [BlockException(
-            inner_corner_loss=present + float(values[0]))])
+        return _more_uneven(study, place, values[0], "inner_corner_loss", "corner_loss")
 
 
 # --- blocks in other slots, or in another orientation: exact, however large the change is

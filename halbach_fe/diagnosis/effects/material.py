@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects.base import (
     MagnetizationEffect,
     Parameter,
     Place,
+    together,
     with_array,
     with_exceptions,
     with_remanence,
@@ -24,7 +25,7 @@ from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.solve import KneeLaw
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.materials import MOST_SQUARE, MU_0, Demagnetization
+from halbach_fe.study.materials import MOST_SQUARE, MU_0, Demagnetization, grade_of
 from halbach_fe.study.model import Study, iron_of
 
 STEP = 0.02
@@ -48,15 +49,8 @@ class RecoilPermeabilityEffect(Effect):
         return ((raised - nominal.finite_element_field) / STEP)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        array, change = study.array, float(values[0])
-        if not array.is_uniform:
-            return with_exceptions(study, [BlockException(
-                ring=block.ring, slot=block.slot,
-                recoil_permeability=max(1.0, block.recoil_permeability + change))
-                for block in build_magnet(study).blocks])
-        return with_array(with_remanence(study),
-                          recoil_permeability=array.recoil_permeability + change,
-                          recoil_permeability_across=array.recoil_permeability_across)
+        return _with_permeabilities(study, lambda along, across: {
+            "recoil_permeability": along + float(values[0]), "recoil_permeability_across": across})
 
 
 class RecoilPermeabilityAcrossEffect(RecoilPermeabilityEffect):
@@ -76,14 +70,27 @@ class RecoilPermeabilityAcrossEffect(RecoilPermeabilityEffect):
         return ((nominal.solve(raised.with_(iron_ring=None, iron=None)) - bare) / STEP)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        array = study.array
-        if not array.is_uniform:
-            return with_exceptions(study, [BlockException(
-                ring=block.ring, slot=block.slot, recoil_permeability_across=max(
-                    1.0, block.recoil_permeability_across + float(values[0])))
-                for block in build_magnet(study).blocks])
-        present = array.recoil_permeability_across or array.recoil_permeability
-        return with_array(study, recoil_permeability_across=present + float(values[0]))
+        return _with_permeabilities(study, lambda along, across: {
+            "recoil_permeability_across": (across or along) + float(values[0])})
+
+
+def _with_permeabilities(
+    study: Study, keys: Callable[[float, float | None], dict[str, float | None]]
+) -> Study:
+    """Return the study with keys by what the relative permeabilities are along the easy axis, and
+    across it where that is another value: of the array, or else of blocks.
+    """
+    array = study.array
+    if array.is_uniform and not any(one.recoil_permeability or one.recoil_permeability_across
+                                    for one in array.exceptions):
+        return with_array(with_remanence(study), **keys(
+            array.recoil_permeability, array.recoil_permeability_across))
+    blocks = build_magnet(study).blocks
+    present = {number: (block.recoil_permeability,
+                        None if block.isotropic else block.recoil_permeability_across)
+               for number, block in enumerate(blocks) if block.remanence}
+    return with_exceptions(study, [BlockException.model_validate(where | keys(*both))
+                                   for where, both in together(blocks, present)])
 
 
 TYPICAL_COEFFICIENT_PER_K = -1e-3
@@ -93,9 +100,13 @@ TYPICAL_COEFFICIENT_PER_K = -1e-3
 def coefficient(study: Study) -> float:
     """Return the relative change of the remanence per kelvin.
 
-    That is the coefficient of the study's prior, or a typical one if the study has none.
+    That is the coefficient of the study's prior, of its table `demagnetization`, or of its grade; a
+    typical one if the study has none.
     """
-    return study.prior.temperature_coefficient_per_K or TYPICAL_COEFFICIENT_PER_K
+    stated = [study.prior.temperature_coefficient_per_K, *(
+        table.remanence_coefficient_per_K
+        for table in (study.demagnetization, grade_of(study.array)) if table is not None)]
+    return next(filter(None, stated), TYPICAL_COEFFICIENT_PER_K)
 
 
 class TemperatureEffect(MagnetizationEffect):
@@ -171,7 +182,7 @@ class KneeEffect(Effect):
         if study.dimension == 2 or (material is not None and material.irreversible):
             return []
         blocks = build_magnet(study).blocks
-        strongest = max((block.remanence for block in blocks), default=0.0)
+        strongest = max((abs(block.remanence) for block in blocks), default=0.0)
         # largest number of blocks for which losses are searched unless the study describes the
         # material: each place takes a solution of the whole magnet, of a few seconds for 64 blocks
         most_blocks = 100
@@ -268,8 +279,10 @@ def _mean_losses(study: Study, materials: Sequence[Demagnetization | None]) -> F
     # Gauss nodes per direction and block at which the field is computed for the cheap estimate
     nodes = 3
     cells = cells_of(blocks, 1, divisions=nodes)
-    easy = np.array([block.easy_axis for block in blocks])
-    strength = np.array([block.remanence for block in blocks])
+    polarization = np.array([block.polarization for block in blocks])
+    strength = np.linalg.norm(polarization, axis=1, keepdims=True)
+    # of blocks that are upside down, too; of missing ones any
+    easy = polarization / np.where(strength > 0, strength, 1.0)
     # within a block, the field without its own polarization is mu_0 H
     field = field_of(blocks, cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
     along = np.einsum("nqi,ni->nq", field, easy[cells.block])
@@ -280,7 +293,7 @@ def _mean_losses(study: Study, materials: Sequence[Demagnetization | None]) -> F
         lost = 1 - KneeLaw.of(material).kept(along)
         share = np.bincount(cells.block, cells.volume * np.einsum(
             "nq,nq->n", cells.weights, lost), len(blocks)) / volume
-        found[number] = -(strength * share)[:, None] * easy
+        found[number] = -share[:, None] * polarization
     return found.reshape(len(materials), -1)
 
 

@@ -43,8 +43,8 @@ STEP_M = 5e-4
 class NeighbourMagnetEffect(Effect):
     """A magnet like this one stands on the same axis.
 
-    A place is the approximate position of its centre along z, on either side. The refinements
-    adjust its strength and its distance.
+    A place is approximately how far along z its centre is from this one's, on either side. The
+    refinements adjust its strength and its distance.
     """
 
     name = "neighbour_magnet"
@@ -282,7 +282,8 @@ class IronRingEffect(Effect):
         inner, outer = place.at_m
         farther, thicker, higher, more = values[1:] or (0.0, 0.0, 0.0, 0.0)
         thickness = max(outer - inner + thicker, thinnest_m)
-        inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
+        magnet = build_magnet(study)
+        inner = max(inner + farther, magnet.array_outer_radius + clearance_m)
         # mild steels have polarizations of 2.0 to 2.15 T and permeabilities of 200 to 3000 where
         # they are not saturated; cast iron has 1.6 T
         lowest_T, typical_T, highest_T = 1.2, 2.0, 2.5
@@ -290,7 +291,7 @@ class IronRingEffect(Effect):
         curve = FroehlichKennellyCurve(
             kind="froehlich_kennelly", initial_relative_permeability=typical * max(1 + more, least),
             saturation_polarization_T=min(max(typical_T + higher, lowest_T), highest_T))
-        (low, high), middle = build_magnet(study).array_ends, build_magnet(study).middle_z_m
+        (low, high), middle = magnet.array_ends, magnet.middle_z_m
         if not middle:
             return study.with_(iron_ring=IronRing(
                 inner_radius_m=inner, outer_radius_m=inner + thickness, curve=curve))
