@@ -161,11 +161,16 @@ class IronSolid:
         return self.outer_radius if self.in_place else float(np.hypot(*self.surface[:2]).max())
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Smallest and largest z in m of the body."""
+        if self.in_place:
+            return self.z_min, self.z_max
+        return float(self.surface[2].min()), float(self.surface[2].max())
+
+    @property
     def half_length(self) -> float:
         """Largest |z| in m of the body."""
-        if self.in_place:
-            return max(-self.z_min, self.z_max)
-        return float(np.abs(self.surface[2]).max())
+        return max(map(abs, self.ends))
 
     def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m lie inside the body, and not on its surface."""

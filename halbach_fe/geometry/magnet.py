@@ -381,6 +381,12 @@ class Magnet(ShownInNotebook):
         """Half the length of the magnet in m, including its iron."""
         return max(self.array_half_length, self.iron_half_length)
 
+    @property
+    def half_length_about_middle(self) -> float:
+        """Half the length in m, including its iron, of the magnet as seen from `middle_z_m`."""
+        ends = np.array([self.array_ends, *(body.ends for body in self.iron)])
+        return float(np.abs(ends - self.middle_z_m).max())
+
     def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are not in air.
 

@@ -377,10 +377,18 @@ class MapCheck(ShownInNotebook):
 
     @property
     def is_too_coarse(self) -> bool:
-        """Whether a large residual changes sign from point to point, as of a field that varies more
-        than the spacing shows.
+        """Whether held-out lines are far off, but not as of a field with sources: what is left
+        changes sign from point to point, or a field without sources describes all readings.
         """
-        return bool(self.structure < ALTERNATES and self.floor_rms_T > VIOLATED * self.size_T)
+        limit_T = VIOLATED * self.size_T
+        alternates = self.structure < ALTERNATES and self.floor_rms_T > limit_T
+        return bool(alternates or (not self.obeys and np.nanmean(
+            self.rms_T**2) <= self.redundancy * limit_T**2))
+
+    @property
+    def left_T(self) -> float:  # noqa: N802 - a unit
+        """Rms of what a field without sources leaves of all readings, for each that tests it."""
+        return float(np.sqrt(np.nanmean(self.rms_T**2) / self.redundancy))
 
     @property
     def floor_rms_T(self) -> float:  # noqa: N802 - a unit

@@ -414,9 +414,11 @@ def stray_rows(stray: StrayField | None) -> Rows:
     if stray is None or stray.unknown:
         return []
     rows = []
+    middle = f"the plane z = {1e3 * stray.middle_z_m:.4g}" + (
+        " mm, its middle" if stray.middle_z_m else "")
     for name, whence, own, reach in (
             ("beside the magnet", "the z axis", stray.radius_m, stray.radial),
-            ("beyond its ends", "the plane z = 0", stray.half_length_m, stray.axial)):
+            ("beyond its ends", middle, stray.half_length_m, stray.axial)):
         if reach is None:
             near = 1e3 * NEAREST * stray.radius_m
             rows.append({
@@ -452,7 +454,8 @@ def stray_figure(stray: StrayField) -> Figure:
     others_t = (1e-4, 2e-4, 1e-3, 5e-3, 2e-2)  # flux densities of the thinner lines of the figure
     figure = figure_of(6.6)
     axes = figure.subplots(2, 2).ravel()
-    radius, half = 1e3 * stray.radius_m, 1e3 * stray.half_length_m
+    radius, half, middle = (
+        1e3 * each for each in (stray.radius_m, stray.half_length_m, stray.middle_z_m))
     reached = [reach.distance_m for reach in (stray.radial, stray.axial) if reach]
     # half width of the figure's planes, relative to the largest distance of the line
     around = 1.15
@@ -468,7 +471,7 @@ def stray_figure(stray: StrayField) -> Figure:
             if out and plane.across == "z":
                 axis.add_patch(Circle((0, 0), out, **look))
             elif out and up:
-                axis.add_patch(Rectangle((-out, -up), 2 * out, 2 * up, **look))
+                axis.add_patch(Rectangle((-out, middle - up), 2 * out, 2 * up, **look))
         low, high = float(plane.size_T.min()), float(plane.size_T.max())
         thin = [value for value in others_t if low < value < high and value != stray.limit_T]
         if thin:
@@ -480,7 +483,8 @@ def stray_figure(stray: StrayField) -> Figure:
             axis.contour(first, second, size, [np.log(stray.limit_T)], colors=POSTERIOR,
                          linewidths=2, linestyles="solid")
         _of_plane(axis, plane.across)
-        axis.set(xlim=(-widest, widest), ylim=(-widest, widest))
+        along = 0.0 if plane.across == "z" else middle
+        axis.set(xlim=(-widest, widest), ylim=(along - widest, along + widest))
         axis.grid(alpha=0.3)
     _explain(axes[-1], stray)
     return figure
@@ -494,5 +498,5 @@ def _explain(axis: Axes, stray: StrayField) -> None:
              Line2D([], [], color="#777777", lw=0.6, label="other |B|, in mT")]
     if stray.radial:
         shown.append(Line2D([], [], color=SECOND, lw=0.8, ls="--",
-                            label="largest distances of\nthat line from the middle"))
+                            label="largest distances of that line\nfrom the z axis and the middle"))
     axis.legend(handles=shown, loc="center", frameon=False)

@@ -13,6 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import first_of
 from halbach_fe.measurement.field_map import has_times, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import (
+    ENOUGH,
     SCATTERED_M,
     VIOLATED,
     InstrumentTerm,
@@ -336,20 +337,28 @@ BROKEN = {"zero": "all components are zero",
           "spike": "far off the field of all others"}
 
 
+def _coarse(check: MapCheck, size: str) -> str:
+    """Say why a map is too coarse to tell; ``size`` is what is left of held-out lines, in words."""
+    if check.left_T <= VIOLATED * check.size_T:
+        return (f"a field without sources describes all readings to {flux_density(check.left_T, 2)}"
+                f", but without a scan line does not predict it ({size}): the lines are too far "
+                "apart, or too few.")
+    return (f"with a spacing of {decimals(1e3 * check.spacing_m)} mm the field changes more from "
+            "point to point than its neighbours show: what a field without sources leaves of it "
+            "changes sign from each reading to the next.")
+
+
 def verdict(check: MapCheck) -> str:
     """Return the answer in a sentence, which begins with whether the map passes."""
-    if check.is_too_coarse:
-        return ("Neither passed nor failed. The map cannot tell: with a spacing of "
-                f"{decimals(1e3 * check.spacing_m)} mm the field changes more from point to point "
-                "than its neighbours show: what a field without sources leaves of it changes sign "
-                "from each reading to the next.")
-    if not check.suffices:
+    if check.redundancy < ENOUGH:
         return ("Neither passed nor failed. The map cannot tell: "
                 f"{100 * (1 - check.redundancy):.0f}\u00a0% of its readings are needed to describe "
                 "any field in its region. Measure in a volume, with a smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
+    if check.is_too_coarse:
+        return f"Neither passed nor failed. The map cannot tell: {_coarse(check, size)}"
     if not check.obeys:
         law = "not obey div B = 0 and curl B = 0" if check.is_whole else (
             f"not have {check.measured} of any field without sources")

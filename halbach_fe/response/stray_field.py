@@ -51,7 +51,7 @@ class Reach:
     """The largest distance at which |B| reaches the limit."""
 
     distance_m: float
-    """From the z axis, or from the plane z = 0."""
+    """From the z axis, or from the plane through the middle of the magnet across z."""
     sd_m: float
     """Its standard deviation, linearized; 0 for the nominal magnet."""
     at_m: tuple[float, float, float]
@@ -80,9 +80,11 @@ class StrayField:
     ----------
     limit_T : float
     radius_m, half_length_m : float
-        Of the smallest cylinder around the magnet that is symmetric about z = 0.
+        Of the smallest cylinder around the magnet that is symmetric about its middle.
+    middle_z_m : float
+        Place of that middle along z, see `halbach_fe.Magnet.middle_z_m`.
     radial, axial : Reach or None
-        The largest distance from the z axis beside the magnet, and from the plane z = 0 beyond its
+        The largest distance from the z axis beside the magnet, and from the middle beyond its
         ends; None if |B| is below the limit wherever it is looked for, see `NEAREST`.
     planes : tuple of StrayPlane
         The planes across x, y and z.
@@ -95,6 +97,7 @@ class StrayField:
     limit_T: float
     radius_m: float
     half_length_m: float
+    middle_z_m: float = 0.0
     radial: Reach | None = None
     axial: Reach | None = None
     planes: tuple[StrayPlane, ...] = ()
@@ -103,7 +106,8 @@ class StrayField:
 
     def summary(self) -> dict[str, object]:
         """Return the distances as plain data for JSON."""
-        return {"limit_T": self.limit_T, "unknown": self.unknown or None,
+        return {"limit_T": self.limit_T, "middle_z_m": self.middle_z_m,
+                "unknown": self.unknown or None,
                 "left_out": list(self.left_out),
                 "radial": None if self.radial is None else asdict(self.radial),
                 "axial": None if self.axial is None else asdict(self.axial)}
@@ -142,9 +146,10 @@ def stray_field(
     check_number("limit_T", "stray_field", limit_T, 1e-9, 1.0)
     if magnet.dimension == 2:
         return None
-    radius, half = magnet.radius, magnet.half_length
+    radius, half = magnet.radius, magnet.half_length_about_middle
+    middle = magnet.middle_z_m
     if not applies(magnet):
-        return StrayField(limit_T, radius, half, unknown=(
+        return StrayField(limit_T, radius, half, middle, unknown=(
             "The magnet is solved on a mesh as a whole, which does not tell the field far "
             "outside."))
     field = _field(magnet, session, magnetizations)
@@ -154,30 +159,30 @@ def stray_field(
         angle, along = place.T
         away = radius + distance
         return np.column_stack([away * np.cos(angle), away * np.sin(angle),
-                                (half + distance) * along])
+                                middle + (half + distance) * along])
 
     def beyond(distance: float | Floats, place: Floats) -> Floats:
         angle, along = place.T
         out = np.abs(along) * (radius + distance)
         return np.column_stack([out * np.cos(angle), out * np.sin(angle),
-                                np.where(along < 0, -1, 1) * (half + distance)])
+                                middle + np.where(along < 0, -1, 1) * (half + distance)])
 
     wider = 1.5  # distance from the magnet up to which pictures go, relative to that of the line
     try:
         found = [_farthest(field, surface, near, radius * DISTANCES, limit_T)
                  for surface in (beside, beyond)]
         reached = max((distance for distance, _ in found), default=near)
-        planes = _planes(field, (radius, half), magnet.middle_z_m, near,
+        planes = _planes(field, (radius, half), middle, near,
                          max(wider * reached, radius / 2))
     except PointsOutsideError:
-        return StrayField(limit_T, radius, half, unknown=(
+        return StrayField(limit_T, radius, half, middle, unknown=(
             "The mesh around the iron ends before the field has fallen to that."))
     radial, axial = (
         None if point is None else Reach(
             start + distance, _sd(magnet, field, magnetizations, point, outwards), vector(point))
         for start, (distance, point), outwards in (
             (radius, found[0], np.array([1.0, 1.0, 0.0])), (half, found[1], np.array([0, 0, 1.0]))))
-    return StrayField(limit_T, radius, half, radial, axial, planes,
+    return StrayField(limit_T, radius, half, middle, radial, axial, planes,
                       left_out=tuple(magnet.external.stated))
 
 
@@ -267,9 +272,9 @@ def _largest(field: Field, surface: Surface, distance: float) -> tuple[float, Fl
     # magnet: finer patterns of the field have decayed there. Near a large magnet they are farther
     # apart; there it is looked for about the best place of every row.
     fewest, most = 16, 64
-    (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
+    (x, y, high), (_, _, low) = surface(distance, np.array([[0.0, 1.0], [0.0, -1.0]]))
     out = float(np.hypot(x, y))
-    needed = np.array([2 * np.pi * out, 2 * max(abs(z), out)]) / distance
+    needed = np.array([2 * np.pi * out, 2 * max(abs(high - low) / 2, out)]) / distance
     angles, rows = np.clip(needed, fewest, most).astype(int).tolist()
     places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
                                   np.linspace(-1, 1, rows)), axis=-1)
@@ -297,7 +302,8 @@ def _sd(
     """
     if magnetizations is None:
         return 0.0
-    direction = outwards * point / np.linalg.norm(outwards * point)
+    direction = outwards * (point - [0.0, 0.0, magnet.middle_z_m])
+    direction /= np.linalg.norm(direction)
     step = 1e-3 * float(np.linalg.norm(point))
     there = field(point + step * np.outer([-1.0, 0.0, 1.0], direction))
     inner, size, outer = np.linalg.norm(there, axis=1)
@@ -324,7 +330,7 @@ def _planes(
     one = np.ones_like(side)
     along = np.concatenate([side, one, -side, -one, side[:1]])
     up = np.concatenate([-one, side, one, -side, -one[:1]])
-    box = ((radius + distances) * along, (half + distances) * up)
+    box = ((radius + distances) * along, middle_z_m + (half + distances) * up)
     found = []
     for number, (across, (first, second)) in enumerate((("x", box), ("y", box), ("z", ring))):
         points = np.full((*first.shape, 3), [0.0, 0.0, middle_z_m])

@@ -636,6 +636,29 @@ def test_a_map_that_is_too_coarse_cannot_tell(generator, tmp_path):
         assert json.loads((tmp_path / name / "check.json").read_text())["suffices"] is False
 
 
+@pytest.mark.parametrize("is_broken", [False, True])
+@pytest.mark.parametrize("planes", [5, 13])
+def test_a_sparse_map_is_not_called_broken(generator, planes, is_broken):
+    """Planes 15 mm apart, 7 mm from cubes of a quadrupole: the field obeys, and "Failed" was said.
+
+    Controls: planes 5 mm apart pass, and lines of By that are shuffled fail on either grid.
+    """
+    across = np.linspace(-0.008, 0.008, 5)
+    points = np.array([[x, y, z] for z in np.linspace(-0.03, 0.03, planes)
+                       for y in across for x in across])
+    cubes = magpylib.Collection([magpylib.magnet.Cuboid(
+        dimension=(0.012, 0.012, 0.04), position=(0.021 * np.cos(angle), 0.021 * np.sin(angle), 0),
+        polarization=(1.3 * np.cos(3 * angle), 1.3 * np.sin(3 * angle), 0))
+        for angle in 2 * np.pi * np.arange(8) / 8])
+    field = cubes.getB(points) + NOISE_T * generator.standard_normal(points.shape)
+    if is_broken:
+        lines = field[:, 1].reshape(planes, 25)
+        field[:, 1] = lines[:, generator.permutation(25)].ravel()
+    said = verdict(check_map(field_map(points, field)))
+    assert said.startswith("Failed" if is_broken else "Passed" if planes > 5 else "Neither")
+    assert ("describes all readings to" in said) == (not is_broken and planes == 5)
+
+
 def test_command(generator, tmp_path, capsys):
     field = read_by(generator) * [1, 1, -1]
     write_map(field_map(GRID, field), tmp_path / "map.csv")
@@ -988,7 +1011,8 @@ def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
         assert far.said.startswith("Passed. ")  # in that region, to 2 % of the largest field
         assert far.command == "halbach-fe check DIR/inner_map.csv -o DIR2"
     assert inner(CLEAN) is None
-    failed = answer(replace(CLEAN, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
+    failed = answer(replace(CLEAN, floor_T=np.full(3, 0.03 * CLEAN.size_T),
+                            rms_T=np.full(3, 0.03 * CLEAN.size_T)))
     assert failed.said.startswith("Failed. ")  # control: it obeys nowhere
     assert "not described by a field without sources within its region" in failed.said
     # a right map that ended 6 mm from blocks, in steps of 6 mm, was not to be used

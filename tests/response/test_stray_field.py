@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_title
+from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_rows, stray_title
 from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import DISTANCES, NEAREST, _farthest, stray_field
@@ -105,7 +105,9 @@ def test_a_lone_cube_far_from_the_axis(tmp_path):
     stray = stray_field(build_magnet(parse_study(LONE)), Session.open(tmp_path))
     moment = REMANENCE_T * CUBE_M**3 / MU_0
     above = (2e-7 * moment / 5e-4)**(1 / 3)
-    assert stray.axial.distance_m == pytest.approx(0.03 + above, rel=2e-3)
+    assert stray.axial.distance_m == pytest.approx(above, rel=2e-3)
+    assert abs(stray.axial.at_m[2] - 0.03) == pytest.approx(stray.axial.distance_m)
+    assert (stray.half_length_m, stray.middle_z_m) == pytest.approx((CUBE_M / 2, 0.03))
     assert stray.axial.at_m[:2] == pytest.approx((0.1, 0.0), abs=5e-3)
     # beside a dipole the largest r sin(theta) of r^3 = sqrt(1 + 3 cos^2 theta) decides
     angle = np.linspace(0, np.pi, 10_001)
@@ -151,14 +153,26 @@ def test_the_pictures_show_the_field(tmp_path, magnet):
         assert plane.size_T[-1].max() < stray.limit_T < plane.size_T[0].max()
 
 
-def test_the_picture_across_z_is_in_the_middle_of_the_magnet(tmp_path):
+def test_the_pictures_are_about_the_middle_of_the_magnet(tmp_path):
     """Of a magnet away from z = 0, too, where the plane z = 0 lies outside of it."""
     far = changed(LONE, array__free_blocks=LONE["array"]["free_blocks"] | {"z_m": [0.3]})
-    plane = stray_field(build_magnet(parse_study(far)), Session.open(tmp_path)).planes[2]
+    stray = stray_field(build_magnet(parse_study(far)), Session.open(tmp_path))
     cube = magpylib.magnet.Cuboid(dimension=3 * (CUBE_M,), polarization=(0, 0, REMANENCE_T))
+    plane = stray.planes[2]
     at = np.stack([plane.first_m - 0.1, plane.second_m, 0 * plane.first_m], axis=-1)
     size = np.linalg.norm(cube.getB(at.reshape(-1, 3)), axis=1)
     assert plane.size_T.ravel() == pytest.approx(size, rel=1e-6)
+    for plane in stray.planes[:2]:
+        across = 0 * plane.first_m
+        x, y = (across, plane.first_m) if plane.across == "x" else (plane.first_m, across)
+        at = np.stack([x - 0.1, y, plane.second_m - 0.3], axis=-1)
+        size = np.linalg.norm(cube.getB(at.reshape(-1, 3)), axis=1)
+        assert plane.size_T.ravel() == pytest.approx(size, rel=1e-6)
+        assert (plane.second_m.max() + plane.second_m.min()) / 2 == pytest.approx(0.3)
+    for axis in stray_figure(stray).axes[:2]:
+        assert [np.mean(axis.get_ylim()), *(each.get_center()[1] for each in axis.patches)] == (
+            pytest.approx([300.0] * 3))
+    assert stray_rows(stray)[1]["from"] == "the plane z = 300 mm, its middle"
 
 
 def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path, magnet):
