@@ -155,7 +155,8 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     known = scale * apart
     # a wide matrix has the left singular vectors of the triangle of its transpose; products with
     # itself, of the size of the points, would take minutes where these are thousands
-    tall = known if len(known) >= known.shape[1] else np.linalg.qr(known.T, mode="r").T
+    tall = known if len(known) >= known.shape[1] else np.asarray(
+        np.linalg.qr(known.T, mode="r")).T
     vectors, sizes, _ = np.linalg.svd(tall, full_matrices=False)
     # smallest singular value that is kept, relative to the largest one. What is left out changes
     # rms deviations by less than 1e-6 of themselves.

@@ -240,9 +240,9 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
                 + _more(errors))
     if kind == "extra_forbidden":
         name = str(first["loc"][-1])
-        near = did_you_mean(name, model.model_fields if model else ())
-        advice = near or (f"Known keys here: {', '.join(model.model_fields)}." if model else "")
-        if not near and len(first["loc"]) > 1 and name in root.model_fields and not isinstance(
+        meant = did_you_mean(name, model.model_fields if model else ())
+        advice = meant or (f"Known keys here: {', '.join(model.model_fields)}." if model else "")
+        if not meant and len(first["loc"]) > 1 and name in root.model_fields and not isinstance(
                 value, Mapping):
             advice = f"`{name}` stands at the top of the file, above the first table."
         found = f"`{name}`"
