@@ -153,12 +153,15 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     scale = np.array([largest] * others.shape[1] + [
         largest if name[-3:-1] == ".M" else 1.0 for name in response.parameters] + [1.0])
     known = scale * apart
-    values, vectors = np.linalg.eigh(known @ known.T)
-    # smallest eigenvalue of the matrix of products that is kept, relative to the largest one;
-    # smaller ones are rounding errors. What is left out changes rms deviations by less than 1e-6 of
-    # themselves.
-    kept_share = 1e-13
-    kept = vectors[:, values > kept_share * values[-1]]
+    # a wide matrix has the left singular vectors of the triangle of its transpose; products with
+    # itself, of the size of the points, would take minutes where these are thousands
+    tall = known if len(known) >= known.shape[1] else np.asarray(
+        np.linalg.qr(known.T, mode="r")).T
+    vectors, sizes, _ = np.linalg.svd(tall, full_matrices=False)
+    # smallest singular value that is kept, relative to the largest one. What is left out changes
+    # rms deviations by less than 1e-6 of themselves.
+    kept_share = 3e-7
+    kept = vectors[:, sizes > kept_share * sizes[0]]
     values = np.vstack([mean, kept.T @ apart])
     error = np.sqrt(weights) * np.linalg.norm(response.error[rows].reshape(-1, 3), axis=1)
     beside = others.shape[1]

@@ -71,7 +71,7 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
                       f"Not before the positions are checked. {far} {of_blocks}",
                       "Correct the positions, or go on if they are meant to be there.",
                       "halbach-fe solve STUDY -o DIR", False)
-    if error <= ROUNDING * high:
+    if solution.magnet.is_vacuum and error <= ROUNDING * high:
         return Answer(question, said,
                       "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "
                       f"there is no iron, so that it is a closed form, without a mesh. {of_blocks}",

@@ -65,11 +65,16 @@ def _coarsest(found: Verification) -> int:
     return min([*changed, STEPS - 1])
 
 
+def _is_exact(found: Verification) -> bool:
+    """Tell whether the field is a closed form; iron far away may add less than the rounding."""
+    return found.magnet.is_vacuum and found.error_pointwise < ROUNDING
+
+
 def difference_table(found: Verification) -> Rows:
     """Return rows of text: the change of the field for each change of the model, and the error, in
     ppm of the largest field; none if the field is exact.
     """
-    if found.error_pointwise < ROUNDING:
+    if _is_exact(found):
         return []
 
     def row(what: str, pointwise: float, fourier: float | None) -> dict[str, str]:
@@ -92,7 +97,7 @@ def answer(found: Verification) -> Answer:
     error, main = found.error_pointwise * found.main_field_T, found.main_field_T
     measure = ("Measure the magnet, and update its blocks with the map.",
                "halbach-fe infer STUDY --measurements MAP -o DIR")
-    if found.error_pointwise < ROUNDING:
+    if _is_exact(found):
         return Answer(question, "The computed field is not off at all: no finite elements are "
                       "needed, it is the exact one of the blocks in vacuum "
                       f"({flux_density(main, 4)} at most).",

@@ -132,8 +132,8 @@ def stray_field(
     Returns
     -------
     StrayField or None
-        None for a cross-section, whose magnet has no ends. If the blocks or their iron are meshed
-        together, it only says that the field far outside is not known.
+        None for a cross-section, whose magnet has no ends. By the method `direct` it only says that
+        the field far outside is not known.
 
     Examples
     --------

@@ -10,7 +10,6 @@ name any file on the machine.
 from __future__ import annotations
 
 import csv
-import difflib
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -564,12 +563,11 @@ def _check_columns(header: Sequence[str], where: str) -> None:
             if header.index(name) < number - 1:
                 raise StudyError(must_be("header", where, "without repeated columns", f"'{name}'"))
             continue
-        near = [column for column in COLUMNS if name and column.startswith(f"{name}_")] or (
-            difflib.get_close_matches(name[:100], COLUMNS, 1, 0.6))
+        begun = [column for column in COLUMNS if name and column.startswith(f"{name}_")]
+        near = did_you_mean(name, begun[:1], 0.0) or did_you_mean(name, COLUMNS, 0.6)
         raise StudyError(must_be(
             f"column {number}", where, "a known column", f"'{name}'" if near else "another name",
-            did_you_mean(near[0], name) if near
-            else f"Known columns: {', '.join(COLUMNS)}."))
+            near or f"Known columns: {', '.join(COLUMNS)}."))
 
 
 def _check_count(count: int, where: str) -> None:

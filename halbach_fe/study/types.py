@@ -10,7 +10,7 @@ import difflib
 import math
 import re
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
@@ -79,11 +79,22 @@ UNITS = ("m", "T", "deg", "rad", "C", "K")
 """Units at the end of names."""
 
 
-def did_you_mean(near: str, given: str) -> str:
-    """Return the question for a known name that is near, and for its unit if only that differs."""
-    stem, _, unit = near.rpartition("_")
-    other = unit in UNITS and stem == given.rpartition("_")[0]
-    return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
+def did_you_mean(given: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+    """Return the question for the nearest known name, empty if none is near.
+
+    It says what becomes of values if only the unit differs, or if diameters were given.
+    """
+    as_radius = given[:100].replace("diameter", "radius")
+    near = difflib.get_close_matches(as_radius, list(known), 1, cutoff)
+    if not near:
+        return ""
+    stem, _, unit = near[0].rpartition("_")
+    other = unit in UNITS and unit != given.rpartition("_")[2] and stem == (
+        as_radius.rpartition("_")[0])
+    halved = as_radius != given[:100]
+    to_do = ["halve its values"] * halved + [
+        f"convert {'them' if halved else 'its values'} to {unit}"] * other
+    return f"Did you mean `{near[0]}`?" + (f" Then {' and '.join(to_do)}." if to_do else "")
 
 
 KILOOERSTED = 1e6 / (4 * math.pi)
@@ -229,10 +240,9 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
                 + _more(errors))
     if kind == "extra_forbidden":
         name = str(first["loc"][-1])
-        near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
-        advice = (did_you_mean(near[0], name) if near
-                  else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
-        if not near and len(first["loc"]) > 1 and name in root.model_fields and not isinstance(
+        meant = did_you_mean(name, model.model_fields if model else ())
+        advice = meant or (f"Known keys here: {', '.join(model.model_fields)}." if model else "")
+        if not meant and len(first["loc"]) > 1 and name in root.model_fields and not isinstance(
                 value, Mapping):
             advice = f"`{name}` stands at the top of the file, above the first table."
         found = f"`{name}`"
@@ -482,10 +492,9 @@ class StudyModel(BaseModel):
         for key, value in changes.items():
             name, nested, rest = key.partition("__")
             if name not in values:
-                near = difflib.get_close_matches(name, values, 1, 0.5)
                 raise StudyError(must_be(
-                    "name", where, "a key of it", f"`{name}`", did_you_mean(near[0], name)
-                    if near else f"Known keys here: {', '.join(values)}."))
+                    "name", where, "a key of it", f"`{name}`", did_you_mean(name, values)
+                    or f"Known keys here: {', '.join(values)}."))
             if nested and not isinstance(values[name], StudyModel):
                 raise StudyError(must_be(
                     f"`{name}`", where, f"a table, for `{key}` to change a key of it",

@@ -176,6 +176,18 @@ def of_verify(given):
     return verification.answer(found), [flux_density(found.main_field_T, 4), "exact"]
 
 
+def test_a_field_beside_iron_is_never_called_a_closed_form(given):
+    """A sphere 5 m away changes it by less than the computer rounds: pages said there was none."""
+    beside = given.magnet.with_(iron={"relative_permeability": 1000.0, "bodies": [
+        {"kind": "sphere", "radius_m": 0.005, "centre_m": [5.0, 0.0, 0.0]}]})
+    for found, answer in ((hf.solve(given.magnet, given.session), solution.answer),
+                          (hf.verify(given.magnet, given.session), verification.answer)):
+        for magnet, is_exact in ((given.magnet, True), (beside, False)):
+            said = answer(replace(found, magnet=magnet))
+            assert ("exact" in said.said + said.trust) == is_exact
+    assert verification.difference_table(replace(found, magnet=beside))
+
+
 def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
     """A Fourier coefficient is off by less than B at a point: each answer says what is meant."""
     for quantity, settings in (("flux_density", {}), (

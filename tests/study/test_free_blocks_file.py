@@ -93,6 +93,7 @@ def test_hdf5_of_other_programs(tmp_path):
     (" x_m ", "x", "column 1 of .* must be a known column; .* 'x'. Did you mean `x_m`"),
     (" x_m ", "s3cret", "column 1 .* another name. Known columns: name, type"),
     (" x_m ", "y_m", "without repeated columns; .* 'y_m'"),
+    ("radius_m", "diameter_m", "Did you mean `radius_m`\\? Then halve its values"),
     ("radius_m", "radius", "Did you mean `radius_m`"),
     (".02,0.03", "zwei,0.03", "`size_y_m` in line 4 of .* a finite number"),
     (".02,0.03", "nan,0.03", "`size_y_m` in line 4 of .* a finite number"),

@@ -142,6 +142,9 @@ def test_a_number_for_a_list_is_not_said_to_be_in_another_unit(changes):
      "a whole new table; `array__KEY=...` changes one of its keys."),
     ({"array__inner_radius_mm": 100},
      "Did you mean `inner_radius_m`? Then convert its values to m."),
+    ({"array__inner_diameter_m": 0.1}, "Did you mean `inner_radius_m`? Then halve its values."),
+    ({"array__outer_diameter_mm": 200},
+     "Did you mean `outer_radius_m`? Then halve its values and convert them to m."),
     ({"observation__positions": {"radius_m": 0.1}}, "Add the key, as one of 'line', 'circles', "),
 ])
 def test_changes_have_the_sentences_of_a_file(changes, said):
