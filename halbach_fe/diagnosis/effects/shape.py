@@ -172,29 +172,31 @@ def _along_its_axes(nominal: NominalFields, place: Place, number: int) -> list[F
 
 def _about_its_axes(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
     """Return what a block changes that turns about its own axes through its centre."""
-    return [_turning(nominal, number, axis) for axis in _own_axes(nominal, number)]
+    return [_turning(nominal, number, axis, nominal.blocks[number].mounted_middle)
+            for axis in _own_axes(nominal, number)]
 
 
-def _about_the_axis(*axes: Floats) -> Callable[[NominalFields, Place, int], list[Floats]]:
-    """Return what a block changes that turns with its ring, about each of some axes (3,) through
-    the point of the magnet's axis at its height.
-    """
-    def changes(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
-        arm = nominal.blocks[number].middle * [1.0, 1.0, 0.0]
-        return [_turning(nominal, number, axis) + nominal.block_translation_derivative(
-            number, np.cross(axis, arm)) for axis in axes]
-    return changes
+def _about_z(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that turns about the magnet's axis."""
+    return [_turning(nominal, number, Z, np.zeros(3))]
 
 
-def _turning(nominal: NominalFields, number: int, axis: Floats) -> Floats:
-    """Return what a block changes where it is mounted, per rad by which an exception rotates it.
+def _about_its_middle(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that tilts about x and y with its ring."""
+    return [_turning(nominal, number, axis, nominal.blocks[number].middle * Z) for axis in (X, Y)]
 
-    Rotation vectors add up: of a block that is rotated already, it turns about another axis.
+
+def _turning(nominal: NominalFields, number: int, axis: Floats, centre: Floats) -> Floats:
+    """Return what a block changes per rad by which an exception rotates it about a point.
+
+    Rotation vectors add up: a block that is rotated already turns about another axis.
     """
     block, step = nominal.blocks[number], 1e-6
     more = Rotation.from_rotvec(block.rotation_rad + step * axis)
     turn = (more * Rotation.from_rotvec(block.rotation_rad).inv()).as_rotvec() / step
-    return nominal.block_rotation_derivative(number, turn, block.mounted_middle)
+    there = block.mounted_middle
+    return (nominal.block_rotation_derivative(number, turn, there)
+            + nominal.block_translation_derivative(number, np.cross(axis, there - centre)))
 
 
 def _several_rings(study: Study) -> list[Place]:
@@ -320,13 +322,13 @@ EFFECTS = (
             lambda study, place, values: [
                 BlockException(ring=place.ring, shift_m=(0.0, 0.0, values[0]))]),
     MoveRow("ring_twisted", "rotation of a ring about the axis",
-            (Parameter("angle", "rad", 2e-3),), each_ring, _about_the_axis(Z),
+            (Parameter("angle", "rad", 2e-3),), each_ring, _about_z,
             lambda study, place, values: [
                 BlockException(ring=place.ring, twist_deg=float(np.degrees(values[0])))]),
     # a shim of 0.1 mm at one side of a ring of 10 cm is 1 mrad
     MoveRow("ring_tilted", "tilt of a ring", (
         Parameter("x", "rad", 2e-3), Parameter("y", "rad", 2e-3)), _several_rings,
-            _about_the_axis(X, Y), lambda study, place, values: [BlockException(
+            _about_its_middle, lambda study, place, values: [BlockException(
                 ring=place.ring, tilt_deg=tuple(np.degrees(values).tolist()))]),
     MoveRow("rings_oval", "oval rings", (Parameter("along x", "m", 2e-4),
                                          Parameter("at 45 degrees", "m", 2e-4)),
