@@ -25,7 +25,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.iron_bodies import BAR, TO_COME, BodiesReaction
+from halbach_fe.solver.iron_bodies import BAR, BodiesReaction
 from halbach_fe.solver.separate_blocks import SeparateReaction, separate_columns, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
@@ -396,9 +396,9 @@ def team13(note: Note) -> None:
          f"peak of process and GetDP for {len(iron.total)} unknowns")
     found, coarse, measured = mean_flux(iron), mean_flux(iron.coarse), np.array(MEASURED_T)
     common.say(f"{len(iron.total)} and {len(iron.coarse.total)} unknowns")
-    more, share = TO_COME[1], BAR[1]  # as of readings, see `BodiesReaction.field_with_errors`
-    extrapolated = found + more * (found - coarse)
-    for number, row in enumerate(zip(measured, extrapolated, share * np.abs(found - coarse), found,
+    change = found - coarse  # as of readings, see `BodiesReaction.field_with_errors`
+    extrapolated = found + iron.coarse.to_come * change
+    for number, row in enumerate(zip(measured, extrapolated, BAR[1] * np.abs(change), found,
                                      coarse, strict=True), start=1):
         common.say("{:2d}: measured {:.3f} T, computed {:.3f} T, bar {:.3f} T, on the mesh "
                    "{:.3f} T, on the coarser one {:.3f} T".format(number, *row))

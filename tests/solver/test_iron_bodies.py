@@ -423,7 +423,8 @@ def test_bars_cover_at_the_largest_growth(session, body, generator):
 def test_bars_cover_beside_a_pole_that_saturates(session):
     """One pole of an undulator between two blocks that it touches, against NGSolve with order 4,
     elements of 2.5 mm and 0.7 mm along edges: it differs by 3e-4 of the field at most from our mesh
-    twice as fine. With 5 mm and 1 mm, NGSolve itself was 1.4e-3 off 4 mm from the pole.
+    twice as fine. With 5 mm and 1 mm, NGSolve itself was 1.4e-3 off 4 mm from the pole. 8 mm and
+    more from it, extrapolated as iron that does not saturate, it was up to 1.1 bars off.
     """
     points, truth = np.moveaxis(1e-3 * np.array([  # m and T
         [(0, -4, 0), (0, -37.644, 0)], [(0, 0, 0), (0, -65.595, 0)],
@@ -444,6 +445,8 @@ def test_bars_cover_beside_a_pole_that_saturates(session):
     found, change = solved.field_with_errors(points)
     error, bars = (np.linalg.norm(each, axis=1) for each in (found - truth, change))
     assert (error <= 2 * bars).all()
+    away = points[:, 1] <= 0
+    assert (error[away] < 0.6 * bars[away]).all()  # 0.4 was measured
     assert np.sqrt(np.mean(bars**2)) < 5 * np.sqrt(np.mean(error**2))
     stronger = np.linalg.norm(found - 1.03 * truth, axis=1)  # the control
     assert np.mean(stronger <= 2 * bars) < 0.6
