@@ -530,17 +530,10 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
         known = {pair: as_stated[pair] for pair in pairs if as_stated[pair].off <= FAR_OFF
                  and as_stated[pair].fits}
         if not known:
-            for one, other in pairs:
-                if (one, other) not in turned:
-                    best = as_stated[one, other]
-                    # of many ways only the likeliest are tried, so the opposite sign alone first
-                    for axes in ([(np.eye(3), -1)], list(_axes())):
-                        if not best.fits or best.off > FAR_OFF:
-                            match = _match_of(maps[one], maps[other], axes)
-                            if not best.fits or (
-                                    match.fits and match.odds > best.odds + CERTAIN):
-                                best = match
-                    turned[one, other] = best
+            for pair in pairs:
+                if pair not in turned:
+                    one, other = pair
+                    turned[pair] = _by_any_axes(maps[one], maps[other], as_stated[pair])
             known = {pair: turned[pair] for pair in pairs}
         first, other = max(known, key=lambda pair: (
             known[pair].fits, not known[pair].is_mirrored, known[pair].odds))
@@ -550,6 +543,21 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
         pose, sign = found[first]
         found[other] = (pose.of(best.pose), sign * best.sign)
     return [found[number] for number in range(len(maps))]
+
+
+def _by_any_axes(one: Checked, other: Checked, best: _Match) -> _Match:
+    """Return the best place of a map on another one, however the axes of its stage are named.
+
+    ``best`` is that with the axes as stated, which stays if others are not certainly likelier.
+    """
+    # of many ways only the likeliest are tried, so the opposite sign alone first
+    for axes in ([(np.eye(3), -1)], list(_axes())):
+        if best.fits and best.off <= FAR_OFF:
+            break
+        match = _match_of(one, other, axes)
+        if not best.fits or (match.fits and match.odds > best.odds + CERTAIN):
+            best = match
+    return best
 
 
 def _refused(one: Checked, other: Checked, best: _Match) -> MeasurementError:
