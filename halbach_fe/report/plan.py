@@ -136,7 +136,7 @@ def _left_of_patterns(plan: MeasurementPlan) -> list[str]:
     vague, little = 0.7, 0.97
     left, of_study = _patterns(plan)
     blocks = rms(plan.planned_sd) / rms(plan.prior_sd)
-    rest = ", so that these are better places" if _is_worse(plan) else ", which is hardly more"
+    rest = ", so that these are better places" if _is_worse(plan) else ", about as far"
     beside = "" if _is_the_study(plan) else (
         f"; with as many of the study's own positions to {fraction(of_study)}"
         f"{'' if left < little * of_study else rest}")

@@ -941,8 +941,10 @@ def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     assert "the first 1 " not in vague
 
 
-def test_candidates_that_tell_less_than_the_study_are_no_places_to_measure(given):
-    """Of far candidates the page said that the study's own positions tell "hardly more"."""
+def test_candidates_that_tell_less_than_the_study_are_no_places_to_measure(given, monkeypatch):
+    """Of far candidates the page said that the study's own positions tell "hardly more", and of
+    others that 48.5 % left are hardly more than 54.6 %.
+    """
     far = given.magnet.with_(plan={"candidates": [{
         "kind": "line", "start_m": (0.3, 0.0, 0.0), "end_m": (0.34, 0.0, 0.0), "count": 5}]})
     said = plan.answer(hf.plan(far, given.session, points=3))
@@ -950,9 +952,12 @@ def test_candidates_that_tell_less_than_the_study_are_no_places_to_measure(given
     assert "hardly more" not in said.said
     assert not said.sound
     assert "plan.candidates" in said.step
-    near = plan.answer(hf.plan(given.magnet, given.session, points=3))  # the control
+    found = hf.plan(given.magnet, given.session, points=3)
+    near = plan.answer(found)  # the control
     assert near.sound
     assert "better places" not in near.said
+    monkeypatch.setattr(plan, "_patterns", lambda _: (0.546, 0.485))
+    assert re.search(r"own positions to 48\.5\s%, about as far\.", plan.answer(found).said)
 
 
 def test_a_plan_says_that_its_readings_are_not_held_out(given):
