@@ -336,7 +336,7 @@ class Surroundings:
     names: dict[int, list[str]]
     """Names of the bodies whose faces or edges the point with this number touches."""
     reach: float = np.inf
-    """Distance in m from the middle to which the magnet reaches."""
+    """Distance in m from the origin to which the magnet reaches."""
 
     @property
     def no_air(self) -> Bools:
@@ -372,8 +372,8 @@ class Surroundings:
         if not far.any():
             return None
         distance = np.linalg.norm(self.points, axis=1).max()
-        return (f"{far.sum()} of {len(far)} points lie up to {distance:.3g} m from the middle of "
-                f"the magnet, which reaches to {self.reach:.3g} m: hardly any of its field is left "
+        return (f"{far.sum()} of {len(far)} points lie up to {distance:.3g} m from the origin, from "
+                f"which the magnet reaches to {self.reach:.3g} m: hardly any of its field is left "
                 f"there. Are they in mm? Then write {distance / 1000:.3g} for {distance:.3g}.")
 
     def on_faces(self) -> str | None:

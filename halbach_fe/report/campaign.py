@@ -36,7 +36,7 @@ def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, bloc
     maps = [readings] + ([] if held_out is None else [held_out])
     largest = max(float(np.nanmax(np.abs(column)))
                   for each in maps for column in _columns(study, each).values())
-    more = "" if held_out is None else (
+    more = " (no held-out.csv: no point is between others)" if held_out is None else (
         f", {counted(held_out.sizes['point'], 'more point')} to test predictions (held-out.csv)")
     sigma = _noise(study, readings)
     low, high = float(np.nanmin(sigma)), float(np.nanmax(sigma))

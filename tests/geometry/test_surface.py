@@ -257,7 +257,7 @@ def test_readings_of_all_verbs(session):
 def test_positions_in_mm(session):
     """31 times as far from the middle as the magnet reaches: the answer asks for the unit."""
     far = changed(FACE, observation__positions__points_m=[[0, 0, 1.6], [0, 0, 30]])
-    question = "1 of 2 points lie up to 30 m from the middle of the magnet, which reaches to 0.05"
+    question = "1 of 2 points lie up to 30 m from the origin, from which the magnet reaches to 0.05"
     with pytest.warns(HalbachWarning, match=question):
         said = answer(solve(build_magnet(parse_study(far)), session))
     assert question in said.trust
