@@ -499,7 +499,8 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
         with pytest.raises(StudyError, match=r"turn_rad of join_maps must be a (finite )?number"):
             join_maps(maps, turn_rad=turn_rad)
     check = as_checked(maps)[0].check
-    disobedient = replace(check, floor_T=np.full(3, 0.03 * check.size_T))  # as of shuffled rows
+    left_T = np.full(3, 0.03 * check.size_T)
+    disobedient = replace(check, floor_T=left_T, rms_T=left_T)  # as of shuffled rows
     monkeypatch.setattr(map_join, "check_map", lambda *_: disobedient)
     with pytest.raises(MeasurementError, match=r"'part0'.*obeys Maxwell's equations"):
         join_maps(maps)
