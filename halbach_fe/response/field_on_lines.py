@@ -18,7 +18,7 @@ iron, B is the curl of the vector potential everywhere, and H follows from it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,12 +30,12 @@ from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import MU_0, check_number
-from halbach_fe.geometry.blocks import present_blocks
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
-from halbach_fe.response.block_variation import neighbour_columns
+from halbach_fe.response.block_variation import neighbour_columns, neighbour_remanences
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
@@ -333,9 +333,9 @@ def field_on_lines(
                                 model.whole @ magnetizations.root]).reshape(len(points), 3, -1)
         error = weak = model.error
         polarization = np.zeros((lines.points[..., 0].size, 3, flux.shape[2]))
-    if (others := magnetizations.beside) is not None:
-        flux = flux + neighbour_columns(magnet, points) @ np.column_stack(
-            [others.mean, np.asarray(others.root)])
+        if (others := magnetizations.beside) is not None:
+            flux = flux + neighbour_columns(magnet, points) @ np.column_stack(
+                [others.mean, np.asarray(others.root)])
     shape = lines.points.shape
     every, bars = (each.reshape(-1, *shape[1:], *each.shape[2:]) for each in (
         flux, error.reshape(-1, 3)))
@@ -513,8 +513,8 @@ def _through_blocks(
     """Return B and J, mean and root (n, 3, 1 + q), and the bars (n, 3) of B and mu_0 H, in T.
 
     ``number`` (n,) is the block or iron that a point is in, see `_blocks_of`. In 3D iron answers to
-    the deviations of the blocks too; what their permeability adds is an error bar, chi times that
-    field.
+    the deviations of the blocks too, as to those of neighbours if these act on it; what their
+    permeability adds is an error bar, chi times that field.
 
     StudyError if blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
     """
@@ -529,11 +529,15 @@ def _through_blocks(
     solved = None if magnet.is_vacuum else solve_separate(magnet, session)
     nominal, weak = _nominal_strength(magnet, points, number, solved)
     tensors, remanence = _remanence(magnet, magnetizations)
+    deviations = [(blocks, remanence), *_of_neighbours(magnet, magnetizations)]
     strength = np.zeros((*points.shape, remanence.shape[2]))
-    for block, field in enumerate(unit_fields(blocks, points[~in_iron])):
-        strength[~in_iron] += field @ remanence[block]
+    for others, each in deviations:
+        for block, field in enumerate(unit_fields(others, points[~in_iron])):
+            strength[~in_iron] += field @ each[block]
     if solved is not None and solved.iron is not None:
-        _add_answer(strength, solved.iron, magnet, remanence, points, in_iron)
+        acting = deviations if external_acts(magnet) else deviations[:1]
+        for others, each in acting:
+            _add_answer(strength, solved.iron, others, each, points, in_iron)
     weak += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(strength[..., 0])
     strength[..., 0] += nominal
     polarization, error = np.zeros_like(strength), weak.copy()
@@ -594,6 +598,21 @@ def _remanence(magnet: Magnet, magnetizations: Gaussian) -> tuple[Floats, Floats
     return tensors, MU_0 * tensors[:, :, :magnet.dimension] @ change
 
 
+def _of_neighbours(
+    magnet: Magnet, magnetizations: Gaussian
+) -> list[tuple[tuple[MagnetBlock, ...], Floats]]:
+    """Return the blocks of every neighbour, and the remanences (blocks, 3, 1 + q) in T by which
+    mean and root differ from those that the study states.
+    """
+    if (others := magnetizations.beside) is None:
+        return []
+    change = np.column_stack([others.mean, np.asarray(others.root)])
+    known = neighbour_remanences(magnet)
+    parts = change.reshape(len(known), len(magnet.blocks), 3, -1)
+    return [(blocks, matrices @ part)
+            for (blocks, matrices), part in zip(known, parts, strict=True)]
+
+
 def _through_cross_section(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
     session: Session,
@@ -651,8 +670,8 @@ def _linearized(factor: Floats, slope: Floats, field: Floats) -> Floats:
 
 
 def _add_answer(
-    of_change: Floats, iron: IronReaction | BodiesReaction, magnet: Magnet, remanence: Floats,
-    points: Floats, in_iron: Bools
+    of_change: Floats, iron: IronReaction | BodiesReaction, blocks: Sequence[MagnetBlock],
+    remanence: Floats, points: Floats, in_iron: Bools
 ) -> None:
     """Add to mu_0 H (n, 3, q) in T of deviations what iron answers to them.
 
@@ -662,7 +681,7 @@ def _add_answer(
     angles = 64
     nodes = iron.nodes(angles)
     order = np.concatenate([np.flatnonzero(~in_iron), np.flatnonzero(in_iron)])
-    for block, unit in enumerate(unit_fields(magnet.blocks, nodes)):
+    for block, unit in enumerate(unit_fields(blocks, nodes)):
         if remanence[block].any():
             answer = iron.tangent(np.moveaxis(unit, 2, 0), points[~in_iron], points[in_iron])
             of_change[order] += np.moveaxis(answer, 0, 2) @ remanence[block]

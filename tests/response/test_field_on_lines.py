@@ -172,6 +172,27 @@ def test_b_and_h_inside_iron(body, start, end):
         assert MU_0 * abs(found.strength[0][0, 2, 1]) < 0.02 * abs(field[2, 1])
 
 
+def test_iron_answers_to_what_neighbours_deviate():
+    """In the middle of a sphere it makes B 3 mu / (mu + 2) times that without it, in magpylib's
+    field of a neighbour that is 1 % stronger; H is B / mu. Both were those of vacuum, H mu times
+    too large.
+    """
+    mu = 100.0
+    magnet = magnet_of(size=0.04, external={"neighbours": [{"z_m": 0.06}]}, iron={
+        "bodies": [{"kind": "sphere", "radius_m": 0.015}], "relative_permeability": mu})
+    nominal = magnet.nominal_magnetization
+    known = Gaussian(nominal, 0.0 * nominal[:, None]).with_beside(
+        Gaussian(0.0 * nominal, RELATIVE_SD * nominal[:, None]))
+    found = field_on_lines(magnet, Lines(np.zeros(3), np.array([0, 0.0149, 0]), count=4), known,
+                           Session.temporary(), inside=True)
+    alone = RELATIVE_SD * np.abs(blocks().getB([0.0, 0.0, -0.06]))
+    sd = np.linalg.norm(found.root[0, 0], axis=1)
+    np.testing.assert_allclose(sd, 3 * mu / (mu + 2) * alone, rtol=0.02, atol=0.02 * alone.max())
+    assert np.linalg.norm(sd) > 2 * np.linalg.norm(alone)  # the control: without the iron's answer
+    np.testing.assert_allclose(found.root[0] - found.polarization[0, ..., 1:], found.root[0] / mu,
+                               atol=1e-9 * alone.max())
+
+
 def flat_magnet(permeability=1.0, size=0.004, remanence=((0, 1.3), (0.2, 1.2)), **keys):
     """Square rods, or a single round one that is given as ``keys``."""
     columns = {"name": ["a", "b"], "shape": ["cuboid"] * 2, "size_x_m": [SIZE] * 2,
