@@ -372,9 +372,9 @@ class Surroundings:
         if not far.any():
             return None
         distance = np.linalg.norm(self.points, axis=1).max()
-        return (f"{far.sum()} of {len(far)} points lie up to {distance:.3g} m from the origin, from "
-                f"which the magnet reaches to {self.reach:.3g} m: hardly any of its field is left "
-                f"there. Are they in mm? Then write {distance / 1000:.3g} for {distance:.3g}.")
+        return (f"{far.sum()} of {len(far)} points lie up to {distance:.3g} m from the origin, "
+                f"from which the magnet reaches to {self.reach:.3g} m: hardly any of its field is "
+                f"left there. Are they in mm? Then write {distance / 1000:.3g} for {distance:.3g}.")
 
     def on_faces(self) -> str | None:
         """Return the sentence about points on faces, None if there are none."""
