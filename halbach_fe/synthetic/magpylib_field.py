@@ -261,9 +261,9 @@ def _computation(piece: Piece, polarization: Floats) -> Callable[[Floats], Float
     magnet = import_extra("magpylib").magnet
     if isinstance(shape, SectorBody):
         radii, angles = shape.part(u, v)
-        return _of_source(magnet.CylinderSegment(
+        return _of_segment(_of_source(magnet.CylinderSegment(
             dimension=(*radii, shape.length, *np.degrees(angles)), polarization=polarization,
-            position=(-shape.middle, 0, 0)))
+            position=(-shape.middle, 0, 0))), shape)
     if isinstance(shape, CylinderBody):
         return _of_source(magnet.Cylinder(dimension=(2 * shape.radius, shape.length),
                                           polarization=polarization))
@@ -285,6 +285,32 @@ def _computation(piece: Piece, polarization: Floats) -> Callable[[Floats], Float
         return total
 
     return charged
+
+
+def _of_segment(
+    compute: Callable[[Floats], Floats], shape: SectorBody
+) -> Callable[[Floats], Floats]:
+    """Return the function that gives the field of a segment at points of its axis and near it, too.
+
+    At a ten-thousandth of its radius from the axis of its surfaces magpylib loses up to all digits
+    (12 % at 10 um from the axis of a bore of 92 mm), and none on it. Between the axis and a
+    thousandth of the radius the field is interpolated, which leaves 1e-7 of it.
+    """
+    axis, near = np.array([-shape.middle, 0.0]), 1e-3 * shape.inner
+
+    def field(points: Floats) -> Floats:
+        found, away = compute(points), points[:, :2] - axis
+        distance = np.linalg.norm(away, axis=1)
+        rows = (distance > 0) & (distance < near)
+        if rows.any():
+            on_axis, beside = points[rows], points[rows]
+            on_axis[:, :2] = axis
+            beside[:, :2] = axis + away[rows] * near / distance[rows, None]
+            share = (distance[rows] / near)[:, None]
+            found[rows] = (1 - share) * compute(on_axis) + share * compute(beside)
+        return found
+
+    return field
 
 
 def _of_source(source: Any) -> Callable[[Floats], Floats]:
