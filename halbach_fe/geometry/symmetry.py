@@ -279,6 +279,9 @@ def rotation_deg(turn: Floats) -> tuple[float, float, float]:
     return x, y, z
 
 
+PARALLEL = 1e-3
+"""Difference of unit vectors up to which two directions of a block are one."""
+
 OF_A_BLOCK = ("remanence_T", "recoil_permeability", "recoil_permeability_across",
               "magnetization_gradient", "inner_corner_loss")
 """Keys of an exception that a block takes along, but for its factor; in the order of
@@ -421,16 +424,32 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
         tried += [Rotation.from_euler("z", 2 * np.pi * k / edges) for k in range(1, edges)]
     found: list[tuple[Turn, Floats]] = []
     corners = _corners(block)
-    same_direction = 1e-3  # difference of directions up to which two turns of a block are one
     for turn in sorted(tried, key=lambda each: float(each.magnitude())):
         matrix = axes @ turn.as_matrix() @ axes.T
         direction = matrix @ np.array(block.easy_axis)
         known = [np.array(block.easy_axis), *(each for _, each in found)]
         nearest = min(np.linalg.norm(direction - each) for each in known)
-        if nearest > same_direction and _fits(
+        if nearest > PARALLEL and _fits(
                 block, _shrink(corners) @ matrix.T + corners.mean(axis=0)):
             found.append((_matrix_rows(matrix), direction))
     return tuple(turn for turn, _ in found)
+
+
+def turns_over(block: MagnetBlock) -> tuple[Turn, ...]:
+    """Return the half turns of a block about its middle after which it fits its slot and is
+    magnetized the opposite way: about axes of its shape, and of a round one about any.
+    """
+    easy, corners = np.array(block.easy_axis), _corners(block)
+    found: list[Turn] = []
+    for axis in (*block.shape_axes.T, np.cross(easy, block.shape_axes[:, 2])):
+        size = float(np.linalg.norm(axis))
+        if size < PARALLEL or abs(axis @ easy) > PARALLEL:
+            continue
+        matrix = 2 * np.outer(axis, axis) / size**2 - np.eye(3)
+        if _fits(block, _shrink(corners) @ matrix.T + corners.mean(axis=0)) and not any(
+                np.allclose(matrix, each, 0, PARALLEL) for each in found):
+            found.append(_matrix_rows(matrix))
+    return tuple(found)
 
 
 def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:

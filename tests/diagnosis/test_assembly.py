@@ -224,6 +224,27 @@ def test_orientations_in_which_a_body_fits(size, count):
     assert np.linalg.norm(directions - np.array(block.easy_axis), axis=1).min() > 1
 
 
+@pytest.mark.parametrize("shape", [
+    {"shape": ["cuboid"], "size_x_m": [0.02], "size_y_m": [0.025], "remanence_T": [1.0]},
+    {"shape": ["cylinder"], "radius_m": [0.01], "remanence_x_T": [1.0], "remanence_y_T": [0.3],
+     "remanence_z_T": [0.0]}])
+def test_half_a_turn_is_another_than_a_reversed_block_if_a_deviation_is_known(shape):
+    """Named as reversed and turned, somebody would look for a block that is loose."""
+    table = {"name": ["a"], "x_m": [0.1], "y_m": [0.0], "z_m": [0.0], "size_z_m": [0.03],
+             "rotation_z_deg": [30.0]} | shape
+    study = parse_study(DOCUMENT | {"array": {"free_blocks": table}})
+    magnet, effect = build_magnet(study), EFFECTS["block_put_in_wrongly"]
+    easy = np.array(magnet.blocks[0].easy_axis)
+    known = magnet.nominal_magnetization + 0.02 * np.linalg.norm(
+        magnet.nominal_magnetization) * (np.cross(easy, [0.0, 0, 1]) + np.array([0.0, 0, 1]))
+    for mean, count in ((known, 2), (magnet.nominal_magnetization, 0)):
+        over = [turn for place in effect.shortlist(study, mean, np.eye(3), np.zeros(3))
+                for _, _, turn in effect.sources(magnet, place) if easy @ turn @ easy < -0.999]
+        assert len(over) == count
+        # places have angles to 1e-6 degrees, which are 0.014 of 8e5 A/m
+        assert [(turn @ known + known) @ easy for turn in over] == pytest.approx([0] * count, abs=1)
+
+
 def turned(polarizations, ring, angle_deg, slots, axis="z"):
     """Polarizations after a ring of 12 is turned, each block to another slot."""
     found = polarizations.copy()

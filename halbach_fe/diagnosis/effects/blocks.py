@@ -27,7 +27,7 @@ from halbach_fe.diagnosis.effects.base import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import Move, moves_of_rings, remounted, turns_in_slot
+from halbach_fe.geometry.symmetry import Move, moves_of_rings, remounted, turns_in_slot, turns_over
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -248,24 +248,23 @@ class BlockPutInWronglyEffect(AssemblyEffect):
     title = "block put in the wrong way"
 
     def places(self, study: Study) -> Sequence[Place]:
-        return [place for block in build_magnet(study).blocks if block.remanence
-                for turn in turns_in_slot(block)
-                if (place := _place(block, np.array(turn))) is not None]
+        return list(dict.fromkeys(
+            _place(block, np.array(turn)) for block in build_magnet(study).blocks
+            if block.remanence for turn in (*turns_in_slot(block), *turns_over(block))))
+
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """See `AssemblyEffect.simpler`: half a turn reverses a block, and is another effect where
+        a deviation of its magnetization is known, which is then on the other side.
+        """
+        return [[(number, number, -np.eye(3))] for number in range(len(magnet.blocks))]
 
     def sources(self, magnet: Magnet, place: Place) -> Sources:
         number = magnet.number_of(place.ring, place.slot)
         return [(number, number, Rotation.from_rotvec(np.radians(place.at_m)).as_matrix())]
 
 
-def _place(block: MagnetBlock, turn: Floats) -> Place | None:
-    """Return a place whose ``at_m`` are the components of a rotation vector in degrees; None if
-    the turn reverses the magnetization.
-    """
-    # Cosine below which a turn reverses the magnetization, which is the effect of a reversed block.
-    opposite = -0.999
-    easy = np.array(block.easy_axis)
-    if easy @ turn @ easy < opposite:
-        return None
+def _place(block: MagnetBlock, turn: Floats) -> Place:
+    """Return a place whose ``at_m`` are the components of a rotation vector in degrees."""
     vector = Rotation.from_matrix(turn).as_rotvec(degrees=True)
     vector *= np.sign(vector[np.abs(vector) > 1e-6][-1]) if abs(
         np.linalg.norm(vector) - 180) < 1e-6 else 1.0  # half turns of both signs are the same
@@ -282,8 +281,9 @@ def _angle_in_words(block: MagnetBlock, vector: Floats) -> str:
     radial = rotation_matrix((0.0, 0.0, np.radians(block.angle_deg))).T @ vector / size
     for axis, name in zip(np.eye(3), ("its radius", "its azimuthal direction", "z"), strict=True):
         if abs(abs(axis @ radial) - 1) < 1e-3:
-            return f"{angle} about {'-' if axis @ radial < 0 else ''}{name}"
-    x, y, z = vector / size
+            sign = "-" if axis @ radial < 0 and size < 179.9 else ""  # half turns have none
+            return f"{angle} about {sign}{name}"
+    x, y, z = vector / size + 0.0
     return f"{angle} about ({x:.3g}, {y:.3g}, {z:.3g})"
 
 
