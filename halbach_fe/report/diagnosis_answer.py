@@ -226,7 +226,7 @@ def answer(diagnosis: Diagnosis) -> Answer:
     only_suspected = diagnosis.suspected and not diagnosis.identified
     sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
         diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis)
-        or _is_made_small(diagnosis))
+        or _is_made_small(diagnosis) or _misread_alike(diagnosis))
     imitation = _imitated_in_words(diagnosis)
     if imitation and not _has_imitated(diagnosis):
         doubts.append(imitation)
@@ -293,9 +293,25 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
                 "too small.")
     if diagnosis.suspected:
         return f"Only in part: a suspicion is no certainty. Without it {chi2}."
+    if not _fails(diagnosis) and _misread_alike(diagnosis):
+        return "Only in part: the map can be read in several ways that explain it alike."
     if not _fails(diagnosis):
         return f"No. {diagnosis.after.held_out_conflict or 'The search did not come to rest.'}"
     return f"No: {chi2}."
+
+
+def _misread_alike(diagnosis: Diagnosis) -> list[str]:
+    """Say how a map may have been misread as well, if that gives other blocks.
+
+    A map of a magnet that is its own mirror image looks the same with the other sign of z and of
+    Bz, and blocks and rings then change sides. Where blocks were measured, they tell which it is.
+    """
+    if diagnosis.before.measured_blocks is not None:
+        return []
+    return [f"{f'Map {error.map}' if error.map else 'The map'} would be the same with "
+            f"{joined_by_or([each.text for each in error.alternatives])}, and blocks of an update "
+            "others: how it was taken tells which it is."
+            for error in diagnosis.gross_errors if error.alternatives]
 
 
 def _is_made_small(diagnosis: Diagnosis) -> bool:
@@ -353,6 +369,9 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         return ("Do not use these effects: they changed from round to round, as they do where the "
                 "cause is not in the catalogue. Repeat some lines in another order and with the "
                 "probe turned by 180°: that shows whether magnet or instrument is in error.", again)
+    if _misread_alike(diagnosis):
+        return ("Find out how the map was taken, correct it or the study, and diagnose again: "
+                f"{STUDY_FILE} has the first of the ways in which it can be read.", again)
     if diagnosis.found_anything:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
         if any(map(rivals, diagnosis.identified)):
@@ -542,6 +561,7 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
         f"{_maps(diagnosis, 'do')} not tell {_told_apart(effect, titles)} "
         f"from {joined_by_or(titles_of_rivals(effect, titles))}."
         for effect in diagnosis.identified if rivals(effect)]
+    sentences += _misread_alike(diagnosis)
     if diagnosis.identified and diagnosis.positions:
         sentences.append(
             "The magnet is the same from several sides, so that the readings may be displaced by "

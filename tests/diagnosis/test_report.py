@@ -13,6 +13,8 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
+from halbach_fe.diagnosis.gross_errors import GrossError
+from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
 from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import (
@@ -399,6 +401,27 @@ def test_a_turn_of_the_magnet_exchanges_names(flat, monkeypatch):
         "\n[instrument]\nrotation_rad = [0.01, 0.0, 0.0]\n"))
     assert "as well" not in said(uneven)
     assert "as well" not in said(placed, measured_blocks=("r01s01",))
+
+
+def test_a_map_that_can_be_read_in_two_ways_is_no_plain_yes(flat):
+    """Of a magnet that is its own mirror image the other way gives other blocks, 26 of their bars
+    off in one case.
+    """
+    found, _ = flat
+    found = replace(found, identified=(), suspected=(), imitated=None, after=replace(
+        found.after, prior_conflict=1.0))
+    reversed_z, of_field = (MapConvention(**{key: ("x", "y", "-z")})
+                            for key in ("positions", "fields"))
+    only = GrossError(reversed_z, (), 1.0, 0.0)
+    text = verdict(replace(found, gross_errors=(replace(only, alternatives=(of_field,)),)))
+    assert "Only in part: the map can be read in several ways that explain it alike." in text
+    assert f"would be the same with {of_field.text}, and blocks of an update others" in text
+    assert "Find out how the map was taken" in text
+    # controls: it is the only way; blocks were measured, which tell them apart
+    assert "Yes: " in verdict(replace(found, gross_errors=(only,)))
+    assert "Yes: " in verdict(replace(
+        found, gross_errors=(replace(only, alternatives=(of_field,)),),
+        before=replace(found.before, measured_blocks=("r01s01",))))
 
 
 def test_what_the_error_of_the_solver_hides(flat):
