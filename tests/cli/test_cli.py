@@ -320,7 +320,7 @@ def test_good_iron(study, tmp_path, capsys):
 
 def test_bad_maps(study, measured, tmp_path, capsys):
     out = tmp_path / "out"
-    measured.write_text(measured.read_text().replace("0.55", "nan", 1))
+    measured.write_text(measured.read_text().replace("0.55", "inf", 1))
     code, sentence = refused(["infer", study, "--measurements", measured, "-o", out], capsys)
     assert (code, out.exists()) == (4, False)
     assert "finite number" in sentence
