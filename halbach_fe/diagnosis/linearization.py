@@ -111,8 +111,8 @@ class Linearization:
 
     The signatures of all effects outside the model are those of the study from which the search
     started, so that later rounds reuse them; beside blocks that are reversed, missing or elsewhere
-    in the model, those of that study with these blocks so. In a ring of 12 a reversed one changes
-    what gaps do by a fifth, to which readings are exact.
+    in the model, those of that study with these blocks so. In two rings of 12 blocks, one that is
+    reversed changes the signature of a gap by a fifth of its norm.
     """
 
     corrected: Study
@@ -168,15 +168,23 @@ class Linearization:
         return self.scene_after_moves if self._is_after_moves(effect) else self.scene_at_start
 
     def _is_after_moves(self, effect: Effect) -> bool:
-        """Tell whether blocks are moved first: moves of blocks are in place of each other."""
+        """Tell whether the signature of an effect is that beside the moves of whole blocks in the
+        model. That of another move is not, as it would take the place of one of them.
+        """
         return bool(moves_of(self.identified)) and not isinstance(effect, MOVES)
 
     def _known(self, effect: Effect) -> Signatures:
         """Return the signatures that an earlier search has computed for the same study and maps."""
-        if self._is_after_moves(effect):
-            return self.solver.signatures(
-                self._study_after_moves, self.update, self.update.prior.mean, self.campaign)
+        return self._known_after_moves if self._is_after_moves(effect) else self._known_at_start
+
+    @cached_property
+    def _known_at_start(self) -> Signatures:
         return self.solver.signatures(self.study, self.update, self.prior_mean, self.campaign)
+
+    @cached_property
+    def _known_after_moves(self) -> Signatures:
+        return self.solver.signatures(
+            self._study_after_moves, self.update, self.update.prior.mean, self.campaign)
 
     @cached_property
     def in_model(self) -> dict[tuple[str, Place], IdentifiedEffect]:

@@ -317,17 +317,19 @@ def _exchanged(
                 chosen[index] = best
         return tuple(chosen)
 
-    found = {likelier(chosen)}
-    for one in tuple(found) if len(chosen) > 1 else ():
-        for index, number in enumerate(one):
-            others = [*one[:index], *one[index + 1:]]
-            odds = odds_beside(evidence, candidates, others, prior, excluded)
-            odds[number], least = -np.inf, odds[number] - INDISTINGUISHABLE_LOG_EVIDENCE
-            rival = int(np.argmax(odds))
-            if odds[rival] > least:
-                found.add(likelier([*one[:index], rival, *one[index + 1:]]))
-    return list(max(sorted(found), key=lambda one: log_evidence(
-        evidence, [candidates[number] for number in one]) + prior[list(one)].sum()))
+    first = likelier(chosen)
+    if len(first) < 2:
+        return list(first)
+    found = {first}
+    for index, number in enumerate(first):
+        before, after = first[:index], first[index + 1:]
+        odds = odds_beside(evidence, candidates, [*before, *after], prior, excluded)
+        odds[number], least = -np.inf, odds[number] - INDISTINGUISHABLE_LOG_EVIDENCE
+        rival = int(np.argmax(odds))
+        if odds[rival] > least:
+            found.add(likelier([*before, rival, *after]))
+    return list(max(sorted(found), key=lambda numbers: log_evidence(
+        evidence, [candidates[number] for number in numbers]) + prior[list(numbers)].sum()))
 
 
 def without_needless(

@@ -122,7 +122,10 @@ class MagnetizationGradientEffect(Effect):
 
 
 def _more_uneven(study: Study, place: Place, change: float, key: str, name: str) -> Study:
-    """Return the study with more of what a key of exceptions says, a field of blocks has."""
+    """Return the study in which a property of the blocks at a place is larger by ``change``.
+
+    ``key`` is its key in exceptions, ``name`` that of the attribute of blocks.
+    """
     magnet = build_magnet(study)
     present = {number: getattr(magnet.blocks[number], name) for number in blocks_at(magnet, place)}
     return with_exceptions(study, [
