@@ -26,7 +26,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geo.session import gmsh_session, write_mesh
+from halbach_fe.geo.gmsh_session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius

@@ -19,8 +19,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.study.array import BlockException
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.array_keys import BlockException
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 
 T = TypeVar("T")
