@@ -1,4 +1,4 @@
-"""The verbs that write or convert a single file: studies, maps, tables of blocks."""
+"""The verbs on single files: new studies, import-map, import-blocks and export."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The verbs that compute or design a magnet as its study states it, or as it was measured."""
+"""The verbs on a magnet, as its study states it or as it was measured: solve, verify, field,
+multipoles, homogeneity, forces, demagnetization, design, cad, plan, tolerance, sort, shim,
+shim-tray.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verbs on measured maps and blocks: check, locate, update, diagnose, simulate, report."""
+"""The verbs on measurements: check, register, prior, infer, diagnose, explain, report, simulate."""
 
 from __future__ import annotations
 

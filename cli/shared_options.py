@@ -1,4 +1,4 @@
-"""The options of the verbs: how a verb is declared, options that several verbs share, numbers.
+"""How a verb is declared, options that several verbs share, and the numbers that they take.
 
 Modules of the command line import little at their top, so that help and completion appear without
 delay. Functions that compute something import the modules that they need themselves.

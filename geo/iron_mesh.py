@@ -1,4 +1,4 @@
-"""Mesh of bodies of iron and of the air near them, in curved tetrahedra of second order.
+"""Mesh of bodies of iron alone, and of the air near them, in curved tetrahedra of second order.
 
 Blocks do not shape it. Around the air lies a shell that GetDP maps to the rest of space.
 Rings of iron about z are meshed in `magnet_meshes`, in the half-plane (r, z) or with the blocks.

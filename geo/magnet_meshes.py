@@ -1,4 +1,4 @@
-"""Meshes of a magnet: its cross-section, that stacked in layers along z, and its half-plane (r, z).
+"""Meshes of a magnet with its iron: cross-section, layers of it along z, or half-plane (r, z).
 
 **Equal rings.** The cross-section has blocks of any shape, prisms and tubes of iron, and air up to
 the boundary. All blocks are prisms along z, so that the same plane mesh serves every ring; the

@@ -1,4 +1,4 @@
-"""The time that a long search takes: progress within its steps, time left, and the limit."""
+"""Progress of a long search: the part that is done, the time that is left, and its limit."""
 
 from __future__ import annotations
 

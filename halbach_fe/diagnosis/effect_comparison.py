@@ -1,4 +1,4 @@
-"""Compare all effects of a catalogue at one point of linearization."""
+"""Scores of all effects of the catalogue at one point of linearization, and which are missing."""
 
 from __future__ import annotations
 

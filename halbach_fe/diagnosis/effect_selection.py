@@ -1,4 +1,4 @@
-"""Select the missing effects, and find those that the readings cannot distinguish.
+"""Select the missing effects by their odds, and find those that readings cannot distinguish.
 
 A candidate is an effect at one place (a block or a seam, for example), with one or more amplitudes.
 The prior probability of an effect is shared by its candidates, so that an effect which may be in

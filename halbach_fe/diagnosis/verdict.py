@@ -1,4 +1,4 @@
-"""Decide which effects are named, which are suspected, and whether a cause is unknown.
+"""The verdict: which effects are named, which are suspected, and whether a cause is unknown.
 
 Effects are selected by their odds (`halbach_fe.diagnosis.effect_selection`: the thresholds, and
 when the amplitude that gives an effect its name is determined). They then compete with causes of

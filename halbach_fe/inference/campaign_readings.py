@@ -1,4 +1,4 @@
-"""The readings of all maps of a campaign, stacked: values, noise, and how B becomes a reading.
+"""The readings of all maps of a campaign, stacked: values, noise, operator, and what is held out.
 
 Some of them an update has not seen as a whole: those of another map, or the ends of the map. Where
 two maps overlap, the readings of one are compared with what an update by the other alone predicts

@@ -1,4 +1,4 @@
-"""Readings that are linear only about what an update finds: by terms of instruments, and of |B|.
+"""Updates of readings that are not linear, by terms of instruments and of |B|: their derivatives.
 
 The terms of the instruments are parameters of the update, beside the magnetizations. The readings
 are linear in small changes of the terms, by the gradient of the field of the magnet as it is

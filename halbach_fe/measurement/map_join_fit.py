@@ -1,4 +1,4 @@
-"""Several maps in one field without sources: their relative poses, fitted with the probe's terms.
+"""Fit of the relative poses of several maps in one field without sources, with the probe's terms.
 
 The probe of each map reads as that of `halbach_fe.measurement.probe_fit` does, in axes of its
 own stage, which sees the charges turned and shifted. Terms of the probe are common to all maps, or

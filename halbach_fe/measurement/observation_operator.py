@@ -1,4 +1,4 @@
-"""From B at the sensors to the readings that an inference compares with a model.
+"""The operator from B at the sensors to readings: components, |B|, or Fourier coefficients.
 
 Two linear steps lead from the field to the readings. The mapper's sensors turn B at their positions
 into a field map (`halbach_fe.measurement.probe_law`). The analysis turns the map into readings:

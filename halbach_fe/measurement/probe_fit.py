@@ -1,4 +1,4 @@
-"""A three-axis probe in a field without sources, fitted together with that field.
+"""Fit of a three-axis probe, together with the field without sources in which it was.
 
 The readings are linear in the amplitudes of the field's charges (`halbach_fe.measurement.
 source_free_field`), and nearly so in the parameters of the probe: the places of its sensors, the

@@ -1,4 +1,4 @@
-"""The model of a field mapper: how B at the sensors becomes the values of a map.
+"""The law of the probe of a field mapper: how B at its sensors becomes the values of a map.
 
 The numbers of the model are explained in `halbach_fe.study.measurement_keys.Instrument`. They are
 applied in three ways:

@@ -1,4 +1,4 @@
-"""Noise covariance of readings: the noise stated by map or study, and uncertain positions."""
+"""The noise of readings: a covariance of what map or study states, and of uncertain positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A magnetic field in free space, expanded in charges around the region where it is known.
+"""A magnetic field without sources, expanded in charges around the region where it is known.
 
 Where there are no currents and no magnets, div B = 0 and curl B = 0, so that ``B = -grad psi`` with
 a harmonic psi. Fictitious magnetic charges on a box around the region make such fields only, and

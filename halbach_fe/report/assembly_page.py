@@ -1,4 +1,4 @@
-"""Table and page of the plan to assemble a magnet, with a drawing for every plate."""
+"""Page of `cad`: the plan to assemble a magnet, with a drawing for every plate."""
 
 from __future__ import annotations
 

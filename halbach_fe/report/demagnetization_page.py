@@ -1,4 +1,4 @@
-"""Figures, tables and page of the demagnetization margin."""
+"""Page of `demagnetization`: figures and tables of the margin to the knee."""
 
 from __future__ import annotations
 

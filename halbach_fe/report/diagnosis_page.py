@@ -1,4 +1,4 @@
-"""Sentences, tables and page of a diagnosis."""
+"""Page of `diagnose`: sentences and tables; its answer and figures are modules beside."""
 
 from __future__ import annotations
 

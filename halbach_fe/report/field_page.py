@@ -1,4 +1,4 @@
-"""Tables, figure and page of the field on lines, its integrals and its kicks."""
+"""Page of `field`: the field on lines, its integrals and its kicks."""
 
 from __future__ import annotations
 

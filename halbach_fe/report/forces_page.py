@@ -1,4 +1,4 @@
-"""Table, figure and page of the forces on the blocks of a magnet."""
+"""Page of `forces`: those on the blocks of a magnet."""
 
 from __future__ import annotations
 

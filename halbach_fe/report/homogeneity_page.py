@@ -1,6 +1,4 @@
-"""Tables, figures and page of the homogeneity of a field, and what pages say of the field
-outside of the magnet.
-"""
+"""Page of `homogeneity`, and what pages say of the field outside of the magnet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables, figures and page of an updated magnet."""
+"""Page of `infer`: tables and figures of an updated magnet; its answer is a module beside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sentences, figures, table and page of Maxwell's check of a field map, and of joined maps."""
+"""Page of `check`: sentences and figures of Maxwell's check of a map, or of joined maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables, figures and page of multipoles, and the parts that other pages with multipoles share."""
+"""Page of `multipoles`, and the parts that other pages with multipoles share."""
 
 from __future__ import annotations
 

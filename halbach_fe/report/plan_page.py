@@ -1,4 +1,4 @@
-"""Figures, table and page of a measurement plan."""
+"""Page of `plan`: figures and table of a measurement plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figure, table and page of a prior from measurements of single blocks."""
+"""Page of `prior`: figure and table of measurements of single blocks."""
 
 from __future__ import annotations
 

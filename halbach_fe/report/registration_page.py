@@ -1,4 +1,4 @@
-"""Sentences, table, figure, page and study file of a registration."""
+"""Page of `register`: sentences, table, figure and study file of a pose."""
 
 from __future__ import annotations
 

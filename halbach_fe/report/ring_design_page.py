@@ -1,4 +1,4 @@
-"""The study of a design, its table, figures and page."""
+"""Page of `design`: the study of a design, its table and figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table to fill a shim tray from, figures and page of the field before and after."""
+"""Page of `shim-tray`: the table to fill a tray from, and the field before and after."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures, table and page of the moves of blocks that shim a magnet."""
+"""Page of `shim`: figures and table of the moves of blocks."""
 
 from __future__ import annotations
 

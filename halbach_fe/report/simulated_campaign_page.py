@@ -1,4 +1,4 @@
-"""Figures and page of a simulated campaign.
+"""Page of `simulate-measurement`: a simulated campaign.
 
 They show only what a measurement would give, and nothing of the hidden truth.
 """

@@ -1,4 +1,4 @@
-"""The HTML page of a solved nominal magnet."""
+"""Page of `solve`: the field of the nominal magnet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures, table and page of the assignment of measured blocks to slots."""
+"""Page of `sort`: figures and table of the assignment of measured blocks to slots."""
 
 from __future__ import annotations
 

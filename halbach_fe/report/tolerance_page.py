@@ -1,4 +1,4 @@
-"""The multipoles, or the homogeneity, that result from the tolerances of the blocks."""
+"""Page of `tolerance`: multipoles or homogeneity that result from those of the blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures, table and page of the verification of a study's computed field."""
+"""Page of `verify`: figures and table of the errors of a computed field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of what is designed: rings, a homogeneous region, a shim tray and a holder."""
+"""Keys of a study that describe what is designed: rings, region, shim tray and holder."""
 
 from __future__ import annotations
 

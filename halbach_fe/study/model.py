@@ -1,4 +1,4 @@
-"""The study: a validated description of a magnet, its discretization and its measurement.
+"""The whole study of all keys: a magnet, its discretization (mesh, solver) and its measurement.
 
 The names of keys end with their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors.
 The models are immutable: every result is a function of the study (and of measured data).

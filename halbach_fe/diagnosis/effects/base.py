@@ -1,4 +1,4 @@
-"""Base classes of effects, and functions that several effects share.
+"""What an effect is: parameters with their prior widths, places, signature, and how it is applied.
 
 Every effect has a name, parameters with priors, the places where it can occur, a signature (the
 change of the readings per unit of each parameter, to first order) and a method that applies it to a

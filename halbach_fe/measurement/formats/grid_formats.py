@@ -1,4 +1,4 @@
-"""Regular grids of points: those that export formats need, and those that a header describes.
+"""Formats of regular grids: Opera, SRW, FLUKA, BDSIM and Geant4.
 
 **SRW and FLUKA.** Rows have no positions. Of SRW, ten comments above the columns Bx, By and Bz in m
 and T, where x changes fastest::
