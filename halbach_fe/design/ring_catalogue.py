@@ -16,9 +16,9 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.overlaps import overlapping_blocks
 from halbach_fe.response.region import Region
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.array import Array, Ring
-from halbach_fe.study.design import Design, DesignLayer
-from halbach_fe.study.external import External
+from halbach_fe.study.array_keys import Array, Ring
+from halbach_fe.study.design_keys import Design, DesignLayer
+from halbach_fe.study.external_keys import External
 from halbach_fe.study.model import Study
 
 DECIMALS = 9

@@ -18,12 +18,12 @@ from halbach_fe.design.ring_catalogue import Catalogue, largest_number
 from halbach_fe.design.ring_design import Task, _best_pair, design_rings, search, task_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.page import html_of, write_report
-from halbach_fe.report.ring_design import STUDY_FILE, answer
+from halbach_fe.report.ring_design_page import STUDY_FILE, answer
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
-from halbach_fe.study.array import Ring
-from halbach_fe.study.design import HomogeneityRegion
+from halbach_fe.study.array_keys import Ring
+from halbach_fe.study.design_keys import HomogeneityRegion
 from halbach_fe.study.reader import parse_study, read_study
 
 REGION = Region.sphere(0.025)

@@ -15,8 +15,8 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import coil_field, dipole_field, neighbour_field
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.separate_blocks import external_acts
-from halbach_fe.study.external import AnyCoil, Neighbour, PointDipole
-from halbach_fe.study.iron import FroehlichKennellyCurve, Iron, IronRing, IronTube, SteelCurve
+from halbach_fe.study.external_keys import AnyCoil, Neighbour, PointDipole
+from halbach_fe.study.iron_keys import FroehlichKennellyCurve, Iron, IronRing, IronTube, SteelCurve
 from halbach_fe.study.model import Study, iron_of
 
 
