@@ -254,9 +254,11 @@ def design(arguments: argparse.Namespace) -> int:
     are [design] of the study. Writes study.designed.toml, the study with the best rings, rings.csv,
     design.json, design.html with the designs of larger fields, and its figures.
     """
+    from halbach_fe.design.ring_catalogue import about_origin
+
     study = hf.read_study(arguments.study)
     with common.session(arguments, study) as session:
-        region = common.region_of(arguments, hf.build_magnet(study))
+        region = common.region_of(arguments, about_origin(study))
         found = hf.design_rings(study, session, region, arguments.seed)
     return common.finish(arguments, found)
 

@@ -283,7 +283,7 @@ class _Choices:
     def largest(self) -> list[MagnetBlock]:
         """A block in every place that is as large as the largest magnet in each direction."""
         sizes = np.array([each.size_m for each in self.tray.magnets]).max(axis=0).tolist()
-        largest = self.tray.magnets[0].with_(size_m=tuple(sizes))
+        largest = self.tray.magnets[0].with_(size_m=tuple(sizes), angles_deg=(0.0, 180.0))
         return self._in_all_places(largest)
 
     def _in_all_places(self, magnet: ShimMagnet) -> list[MagnetBlock]:

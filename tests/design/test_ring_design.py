@@ -308,6 +308,23 @@ def test_pages(designed, tmp_path):
     assert "<table" in html_of(designed)
 
 
+def test_rings_that_stand_elsewhere_are_designed_about_the_origin(session, tmp_path):
+    """Designed rings are about z = 0: so is the region, where the study's rings are not."""
+    there = study(array={"ring": [{"z_m": 0.1}]}, rings=4)
+    found = design_rings(there, session)
+    mean, *_ = deviations(found)
+    assert found.region.centre_m == (0.0, 0.0, 0.0)
+    # that of the magnet's middle is far from the mean in the fringe, and near in the bore
+    assert found.best.mean_T == pytest.approx(mean, rel=1e-2)
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(there.model_dump(
+        mode="json", exclude_defaults=True, exclude_none=True)), encoding="utf-8")
+    assert main(["design", str(path), "-o", str(tmp_path / "out"),
+                 "--sphere-m", "0.025"]) == 0
+    told = json.loads((tmp_path / "out/design.json").read_text(encoding="utf-8"))
+    assert told["region"]["centre_m"] == [0.0, 0.0, 0.0]
+
+
 def test_one_type_of_blocks_remains_one():
     """A study whose slots are all of one type has one type in any rings, so that `sort` works."""
     one = parse_study(DOCUMENT | {"prior": {"types": {"cube": list(range(1, 17))}}})
