@@ -206,7 +206,8 @@ def _on_iron(found: Forces) -> Section:
         Table(rows),
         "What blocks, coils and the other bodies of iron do to each body in the finished magnet: "
         "what holds it has to bear that. Bodies that touch, or that no plane separates, have one "
-        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron",
+        "force together. ± is the change from a coarser mesh of the iron, and from longer pieces "
+        "of coils."], "Forces on the iron",
         about=rows)
 
 

@@ -14,7 +14,8 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import ring_catalogue
-from halbach_fe.design.ring_catalogue import Catalogue, largest_number
+from halbach_fe.design.ring_catalogue import Catalogue, largest_number, tables_of
+from halbach_fe.design.ring_catalogue import designed as designed_study
 from halbach_fe.design.ring_design import Task, _best_pair, design_rings, search, task_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.page import html_of, write_report
@@ -205,9 +206,18 @@ def test_radii_between_those_of_the_list_do_better(designed, session):
 
 
 def test_the_reaction_of_permeable_blocks_is_in_the_result(session):
-    found = design_rings(study(array={"recoil_permeability": 1.1}, rings=4), session, REGION)
+    """Each design has that of its own blocks, and not that of the best one."""
+    asked = study(array={"recoil_permeability": 1.1}, rings=4)
+    found = design_rings(asked, session, REGION)
     mean, _, _ = deviations(found)  # in vacuum
     assert 0.002 < abs(found.best.mean_T / mean - 1) < 0.1
+    assert len(found.front) > 1
+    for one in found.front:
+        magnet = build_magnet(designed_study(asked, tables_of(asked, one.z_m, one.rings)))
+        points, weights = REGION.points(4)
+        inner = weights > 0
+        size = np.linalg.norm(magnet.field_T(points[inner]), axis=1)
+        assert one.mean_T == pytest.approx(weights[inner] @ size, rel=1e-5)
 
 
 def test_layers_together_take_radii_of_the_same_number(session):
