@@ -283,6 +283,7 @@ class _Diagnosing:
         self.best: _Round | None = None
         self.rivals: Rivals = {}
         self.models: list[frozenset[Hypothesis]] = []
+        self.noises: list[tuple[frozenset[Hypothesis], tuple[PositionNoise, ...]]] = []
         self.given_up: set[str] = set()
         self.solved: Magnet | None = None  # the last whose single blocks were solved for
         if len(starts) > 1:
@@ -401,12 +402,15 @@ class _Diagnosing:
         """
         estimate = vibration_beyond(
             self.judgement, self.update, self.campaign, self.search, self.position_noise)
-        if self.closing or have_settled(self.position_noise, estimate):
+        model = self.models[-1]
+        earlier = [noise for other, noise in self.noises if other == model]
+        if self.closing or have_settled(self.position_noise, estimate, earlier):
             return False
         sizes = [f"{1e3 * noise.sd_m:.2g} mm{f' in map {noise.map}' if noise.map else ''}"
                  for noise in estimate]
         self.say("vibration: positions with a standard deviation of "
                  f"{' and '.join(sizes) or '0 mm'} are added to the noise")
+        self.noises.append((model, self.position_noise))
         self.position_noise = estimate
         self.signatures.clear()  # they were whitened by the previous noise
         return True

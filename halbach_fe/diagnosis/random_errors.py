@@ -434,8 +434,23 @@ def _of_map(
     return found if log_odds > DETECTION_LOG_ODDS else None
 
 
-def have_settled(old: Sequence[PositionNoise], new: Sequence[PositionNoise]) -> bool:
-    """Tell whether the estimates have converged between two rounds."""
+def have_settled(
+    old: Sequence[PositionNoise], new: Sequence[PositionNoise],
+    earlier: Sequence[Sequence[PositionNoise]] = (),
+) -> bool:
+    """Tell whether the estimates have converged between two rounds.
+
+    They may also take turns with ``earlier`` ones of the same model. The smallest of these is the
+    last then: a larger one hides effects that the map shows.
+    """
+    if _are_close(old, new):
+        return True
+    return any(_are_close(one, new) for one in earlier) and (
+        sum(noise.sd_m for noise in old) <= sum(noise.sd_m for noise in new))
+
+
+def _are_close(old: Sequence[PositionNoise], new: Sequence[PositionNoise]) -> bool:
+    """Tell whether two estimates are of the same maps and about equal."""
     before = {noise.map: noise.sd_m for noise in old}
     # largest relative change between rounds that counts as converged
     tolerance = 0.1

@@ -230,7 +230,13 @@ def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, A
     found = diagnose(study, readings, session, blocks, solver=solver)
     best = own_factors(found, case.hidden)
     if case.outside:
-        best[OUTSIDE_NAME] = factor_of(found, readings, readings["B_T"] - campaign.readings["B_T"])
+        best[OUTSIDE_NAME] = factor_of(found.before, found.corrected_study, readings,
+                                       campaign.readings)
+    if found.position_noise:  # `own_factors` do not know of it, and count it as evidence
+        for name in best.keys() - {one.hypothesis.effect.name for one in found.identified}:
+            best[name] = factor_of(found.after, found.study, readings, simulate_campaign(
+                study, case.seed, hide=[(CAN_BE_HIDDEN[other], values)
+                                        for other, values in case.faults if other != name]).readings)
     result = {"case": case.name, "magnet": study.name, "hidden": list(case.hidden),
               "outside": case.outside, "with_blocks": case.with_blocks,
               "labels": labels_of(study, case.faults), "truth": campaign.truth["effects"],
@@ -375,12 +381,14 @@ def own_factors(found: Diagnosis, hidden: Sequence[str]) -> dict[str, float]:
     return factors
 
 
-def factor_of(found: Diagnosis, readings: xr.Dataset, added: xr.DataArray) -> float:
-    """Log Bayes factor of what was added (n, 3) in T to the readings, of about that size, over
-    blocks that deviate.
+def factor_of(
+    update: InferenceResult, study: Study, readings: xr.Dataset, without: xr.Dataset
+) -> float:
+    """Log Bayes factor of what readings have and others do not, of about that size, over blocks
+    that deviate, by the update of a study.
     """
-    training = Training.of(found.before, Campaign.of(found.corrected_study, readings))
-    column = training.shown(np.nan_to_num(added.values)[None])
+    training = Training.of(update, Campaign.of(study, readings))
+    column = training.shown(np.nan_to_num((readings["B_T"] - without["B_T"]).values)[None])
     return training.marginal.evidence(column, training.residual).fit([0]).log_evidence
 
 

@@ -229,7 +229,12 @@ def test_a_study_with_vibration():
     assert have_settled([found], [PositionNoise(1.0, 3.1e-4)])
     assert not have_settled([found], [])
     assert not have_settled([], [found])
-    assert not have_settled([found], [PositionNoise(1.0, 4e-4)])
+    larger = [PositionNoise(1.0, 4e-4)]
+    assert not have_settled([found], larger)
+    # of two that take turns the smaller is the last, and a third is none of them
+    assert have_settled([found], larger, [[], larger])
+    assert not have_settled(larger, [found], [[], [found]])
+    assert not have_settled([found], [PositionNoise(1.0, 5e-4)], [[], larger])
 
 
 def test_outliers_and_vibration_belong_to_a_map():
