@@ -479,85 +479,121 @@ def _fails(diagnosis: Diagnosis) -> bool:
 def _found(diagnosis: Diagnosis) -> list[str]:
     """Describe in sentences what is missing."""
     titles = catalogue_titles(diagnosis)
-    after, unknown = diagnosis.after, diagnosis.unknown
     sentences = [finding.sentence for finding in other_findings(diagnosis)]
     if diagnosis.solver_error:
         return sentences
     if diagnosis.identified:
-        fits = diagnosis.is_at_rest and not (
-            _fails(diagnosis) or diagnosis.after.held_out_conflict)
-        start = f"{_maps(diagnosis)} explained by" if fits else (
-            "The best explanation of those that were compared is" if diagnosis.is_partial else
-            "The best explanation from the catalogue is")
-        sentences.append(f"{start}: " + "; ".join(
-            _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
+        sentences.append(_explanation(diagnosis, titles))
     elif diagnosis.suspected:
         sentences.append("Nothing can be named for certain.")
-    elif unknown is None and not _fails(diagnosis):
-        several = after.is_campaign
-        these = "these maps" if several else "this map"
-        start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
-                 f"Nothing else is missing that {these} can show: with that," if sentences
-                 else f"Nothing is missing that {these} can show:"
-                 if diagnosis.looked_for is None else
-                 f"Of what was looked for ({', '.join(diagnosis.looked_for)}) nothing is missing "
-                 f"that {these} can show:")
-        agree = "the maps agree" if several else "the map agrees"
-        if diagnosis.after.held_out_conflict:
-            start = "Something is missing that was not found: readings that were held out disagree."
-            agree = f"The others of {these} agree"
-        sentences.append(f"{start} {agree} with the study within noise (chi² per reading "
-                         f"{decimals(after.prior_conflict)}).")
+    elif diagnosis.unknown is None and not _fails(diagnosis):
+        sentences.append(_agreement(diagnosis, beside=bool(sentences)))
     if not diagnosis.identified and _is_restless(diagnosis):
         sentences.append(
             f"Nothing {'that was compared' if diagnosis.is_partial else 'in the catalogue'} "
-            f"explains {'the maps' if after.is_campaign else 'the map'}: "
+            f"explains {'the maps' if diagnosis.after.is_campaign else 'the map'}: "
             f"of {diagnosis.rounds} rounds the study without any effect predicts held-out readings "
             "best.")
-    if unknown is not None:
-        sentences += unknown_sentences(diagnosis, unknown)
+    if diagnosis.unknown is not None:
+        sentences += unknown_sentences(diagnosis, diagnosis.unknown)
     elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
-        disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
-        effect = ("no effect of the catalogue" if not diagnosis.is_partial else
-                  f"none of the effects that were compared ({not_compared(diagnosis)})")
-        other = " The cause may be another effect of the catalogue." * diagnosis.is_partial
-        sentences.append(
-            f"{disagree} with the study (chi² per reading "
-            f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
-            f"and {effect} explains the difference, nor does a smooth field or sensor error."
-            f"{other} The readings scatter as if their noise were "
-            f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that, "
-            "and what may change them from one to the next (mains, backlash, steps of a display).")
-    for suspicion in diagnosis.suspected:
-        sentences.append(suspicion_in_words(suspicion, titles))
-    return sentences
+        sentences.append(_disagreement(diagnosis))
+    return [*sentences, *(suspicion_in_words(each, titles) for each in diagnosis.suspected)]
+
+
+def _explanation(diagnosis: Diagnosis, titles: dict[str, str]) -> str:
+    """Say which effects explain the map, or explain it best."""
+    fits = diagnosis.is_at_rest and not (
+        _fails(diagnosis) or diagnosis.after.held_out_conflict)
+    start = f"{_maps(diagnosis)} explained by" if fits else (
+        "The best explanation of those that were compared is" if diagnosis.is_partial else
+        "The best explanation from the catalogue is")
+    effects = (_effect_in_words(effect, titles) for effect in diagnosis.identified)
+    return f"{start}: {'; '.join(effects)}."
+
+
+def _agreement(diagnosis: Diagnosis, beside: bool) -> str:
+    """Say that the map agrees with the study; ``beside`` other findings if there are any."""
+    several = diagnosis.after.is_campaign
+    these = "these maps" if several else "this map"
+    agree = "the maps agree" if several else "the map agrees"
+    if diagnosis.after.held_out_conflict:
+        start = "Something is missing that was not found: readings that were held out disagree."
+        agree = f"The others of {these} agree"
+    elif diagnosis.uncompared is not None:
+        start = "Nothing was found so far:"
+    elif beside:
+        start = f"Nothing else is missing that {these} can show: with that,"
+    elif diagnosis.looked_for is None:
+        start = f"Nothing is missing that {these} can show:"
+    else:
+        start = (f"Of what was looked for ({', '.join(diagnosis.looked_for)}) nothing is missing "
+                 f"that {these} can show:")
+    return (f"{start} {agree} with the study within noise (chi² per reading "
+            f"{decimals(diagnosis.after.prior_conflict)}).")
+
+
+def _disagreement(diagnosis: Diagnosis) -> str:
+    """Say that the map disagrees with the study, and that nothing explains why."""
+    after = diagnosis.after
+    disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
+    effect, other = "no effect of the catalogue", ""
+    if diagnosis.is_partial:
+        effect = f"none of the effects that were compared ({not_compared(diagnosis)})"
+        other = " The cause may be another effect of the catalogue."
+    return (f"{disagree} with the study (chi² per reading {decimals(after.prior_conflict)}, where "
+            f"{after.conflict_limit:.3g} would be rare), and {effect} explains the difference, nor "
+            f"does a smooth field or sensor error.{other} The readings scatter as if their noise "
+            f"were {np.sqrt(after.prior_conflict):.2g} times as large as the study says: check "
+            "that, and what may change them from one to the next (mains, backlash, steps of a "
+            "display).")
 
 
 def _doubts(diagnosis: Diagnosis) -> list[str]:
     """Say in sentences how far to trust what was found."""
-    titles = catalogue_titles(diagnosis)
-    before, after = diagnosis.before, diagnosis.after
-    sentences = ([] if diagnosis.uncompared is None
-                 else [_cut_in_words(diagnosis.uncompared, diagnosis.rounds)])
+    cut = ([] if diagnosis.uncompared is None
+           else [_cut_in_words(diagnosis.uncompared, diagnosis.rounds)])
     if diagnosis.solver_error:
-        return sentences
-    if diagnosis.identified:
-        held = ["".join(f", and {decimals(fit.chi2_per_reading)} for held-out readings"
-                        for fit in [each for each in fits if each.part != TRAINING][:1])
-                for fits in (region_scores(before, diagnosis.loo_residuals_before),
-                              region_scores(after, diagnosis.loo_residuals_after))]
-        added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
+        return cut
+    sentences = [*cut, *_improvement(diagnosis), *_confusions(diagnosis),
+                 *_search_doubts(diagnosis)]
+    nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
+                   or _fails(diagnosis))
+    if nothing and diagnosis.looked_for is not None:
         sentences.append(
-            f"With {added} in the model, chi² per training reading is "
-            f"{decimals(after.prior_conflict)}{held[1]} (before: "
-            f"{decimals(before.prior_conflict)}{held[0]}).")
-        if _fails(diagnosis) and diagnosis.unknown is None:
-            sentences.append("That is still too large: another cause is missing.")
-        elif diagnosis.after.held_out_conflict:
-            sentences.append(
-                "The held-out readings contradict that, as their chi² should be about 1: another "
-                f"cause looks like {added} where the other readings are.")
-    sentences += [
+            "Only the effects that were chosen (--effects) were looked for: others may be missing.")
+    if nothing and diagnosis.limits and (diagnosis.looked_for is None or {
+            "block_demagnetized", "block_displaced"} <= {*diagnosis.looked_for}):
+        sentences.append(limits_in_words(diagnosis.limits))
+    return sentences
+
+
+def _improvement(diagnosis: Diagnosis) -> list[str]:
+    """Say how well readings agree with the effects in the model, and without them."""
+    if not diagnosis.identified:
+        return []
+    before, after = diagnosis.before, diagnosis.after
+    held = ["".join(f", and {decimals(fit.chi2_per_reading)} for held-out readings"
+                    for fit in [each for each in fits if each.part != TRAINING][:1])
+            for fits in (region_scores(before, diagnosis.loo_residuals_before),
+                          region_scores(after, diagnosis.loo_residuals_after))]
+    added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
+    sentences = [f"With {added} in the model, chi² per training reading is "
+                 f"{decimals(after.prior_conflict)}{held[1]} (before: "
+                 f"{decimals(before.prior_conflict)}{held[0]})."]
+    if _fails(diagnosis) and diagnosis.unknown is None:
+        sentences.append("That is still too large: another cause is missing.")
+    elif after.held_out_conflict:
+        sentences.append(
+            "The held-out readings contradict that, as their chi² should be about 1: another "
+            f"cause looks like {added} where the other readings are.")
+    return sentences
+
+
+def _confusions(diagnosis: Diagnosis) -> list[str]:
+    """Say what else may be in place of the effects that were named."""
+    titles = catalogue_titles(diagnosis)
+    sentences = [
         f"{_maps(diagnosis, 'do')} not tell {_told_apart(effect, titles)} "
         f"from {joined_by_or(titles_of_rivals(effect, titles))}."
         for effect in diagnosis.identified if rivals(effect)]
@@ -580,6 +616,12 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "Far larger than usual (relative to the prior's standard deviation): "
             f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
             "suspect another cause.")
+    return sentences
+
+
+def _search_doubts(diagnosis: Diagnosis) -> list[str]:
+    """Say what the search did not reach, or did not see for errors of the solver."""
+    sentences = []
     if diagnosis.identified and _is_restless(diagnosis):
         sentences.append(
             f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
@@ -593,16 +635,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
             "many effects together are a fit rather than a diagnosis, and some of them take "
             "the place of another cause.")
-    sentences += filter(None, (hidden_by_solver(after), after.too_near))
-    nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
-                   or _fails(diagnosis))
-    if nothing and diagnosis.looked_for is not None:
-        sentences.append(
-            "Only the effects that were chosen (--effects) were looked for: others may be missing.")
-    if nothing and diagnosis.limits and (diagnosis.looked_for is None or {
-            "block_demagnetized", "block_displaced"} <= {*diagnosis.looked_for}):
-        sentences.append(limits_in_words(diagnosis.limits))
-    return sentences
+    return [*sentences, *filter(None, (hidden_by_solver(diagnosis.after),
+                                       diagnosis.after.too_near))]
 
 
 def _maps(diagnosis: Diagnosis, verb: str = "are") -> str:

@@ -509,11 +509,93 @@ def _functions(u: float, v: float, w: float, value: Floats, slope: Floats) -> No
 
 
 @compiled
-def _place(places: Floats, value: Floats, axis: int) -> float:
+def _at(nodes: Floats, value: Floats, axis: int) -> float:
+    """Return a component of a quantity (10, 3) at the nodes, where their functions have a value."""
     total = 0.0
     for node in range(10):
-        total += value[node] * places[node, axis]
+        total += value[node] * nodes[node, axis]
     return total
+
+
+@compiled
+def _is_far(x: float, y: float, z: float, size: float) -> bool:
+    """Tell whether the distance (x, y, z) is far relative to a size."""
+    return x * x + y * y + z * z > (NEAR * size) ** 2
+
+
+@compiled
+def _volume(places: Floats, slope: Floats) -> float:
+    """Return the volume of an element at a point per that of the reference element there."""
+    xu = xv = xw = yu = yv = yw = zu = zv = zw = 0.0
+    for node in range(10):
+        x, y, z = places[node, 0], places[node, 1], places[node, 2]
+        du, dv, dw = slope[node, 0], slope[node, 1], slope[node, 2]
+        xu, xv, xw = xu + x * du, xv + x * dv, xw + x * dw
+        yu, yv, yw = yu + y * du, yv + y * dv, yw + y * dw
+        zu, zv, zw = zu + z * du, zv + z * dv, zw + z * dw
+    return abs(xu * (yv * zw - yw * zv) - xv * (yu * zw - yw * zu) + xw * (yu * zv - yv * zu))
+
+
+@compiled
+def _add_part(x: float, y: float, z: float, part: Floats, share: float, places: Floats,
+              polarization: Floats, reference: Floats, weights: Floats, out: Floats) -> None:
+    """Add the field of a part of an element, by a dipole at each of its own Gauss points.
+
+    The part has the corners (4, 3) in reference coordinates, and ``share`` of the element's volume.
+    """
+    value, slope = np.empty(10), np.empty((10, 3))
+    for q in range(len(weights)):
+        r, s, t = reference[q, 0], reference[q, 1], reference[q, 2]
+        rest = 1 - r - s - t
+        u, v, w = (rest * part[0, 0] + r * part[1, 0] + s * part[2, 0] + t * part[3, 0],
+                   rest * part[0, 1] + r * part[1, 1] + s * part[2, 1] + t * part[3, 1],
+                   rest * part[0, 2] + r * part[1, 2] + s * part[2, 2] + t * part[3, 2])
+        _functions(u, v, w, value, slope)
+        volume = _volume(places, slope) * (weights[q] * share)
+        _add_dipole(
+            x - _at(places, value, 0), y - _at(places, value, 1), z - _at(places, value, 2),
+            volume * _at(polarization, value, 0), volume * _at(polarization, value, 1),
+            volume * _at(polarization, value, 2), out)
+
+
+@compiled
+def _divide(part: Floats, parts: Floats) -> None:
+    """Set the corners (8, 4, 3) of the eight parts of a tetrahedron (4, 3)."""
+    corners = np.empty((10, 3))
+    corners[:4] = part
+    corners[4], corners[5], corners[6] = (
+        (part[0] + part[1]) / 2, (part[0] + part[2]) / 2, (part[0] + part[3]) / 2)
+    corners[7], corners[8], corners[9] = (
+        (part[1] + part[2]) / 2, (part[1] + part[3]) / 2, (part[2] + part[3]) / 2)
+    for child in range(8):
+        for corner in range(4):
+            parts[child, corner] = corners[CHILDREN[child, corner]]
+
+
+@compiled
+def _add_near(x: float, y: float, z: float, reach: float, places: Floats, polarization: Floats,
+              reference: Floats, weights: Floats, out: Floats) -> None:
+    """Add the field of a near element: of its parts, divided until each is far or at `DEEPEST`."""
+    waiting = np.empty((8 * DEEPEST + 8, 4, 3))  # parts, the next one last
+    depth = np.empty(8 * DEEPEST + 8, np.int64)
+    value, slope = np.empty(10), np.empty((10, 3))
+    waiting[0] = 0.0
+    waiting[0, 1, 0] = waiting[0, 2, 1] = waiting[0, 3, 2] = 1.0  # the whole element
+    depth[0] = 0
+    count = 1
+    while count:
+        count -= 1
+        part, level = waiting[count].copy(), depth[count]
+        u, v, w = part[:, 0].sum() / 4, part[:, 1].sum() / 4, part[:, 2].sum() / 4
+        _functions(u, v, w, value, slope)
+        far = _is_far(x - _at(places, value, 0), y - _at(places, value, 1),
+                      z - _at(places, value, 2), reach / 2.0**level)
+        if far or level == DEEPEST:
+            _add_part(x, y, z, part, 1 / 8.0**level, places, polarization, reference, weights, out)
+        else:
+            _divide(part, waiting[count:count + 8])
+            depth[count:count + 8] = level + 1
+            count += 8
 
 
 @compiled
@@ -536,79 +618,17 @@ def add_field(first: int, last: int, points: Floats, middle: Floats, reach: Floa
     reference, weights : ndarray, shapes (q, 3) and (q,)
         The rule of quadrature on the reference element.
     """
-    corners = np.empty((8 * DEEPEST + 8, 4, 3))
-    depth = np.empty(8 * DEEPEST + 8, np.int64)
-    value, slope = np.empty(10), np.empty((10, 3))
-    middles = np.empty((6, 3))
-    jacobian = np.empty((3, 3))
-    p = np.empty(3)
     for n in range(first, last):
         x, y, z = points[n]
         total = out[n]
         total[:] = 0.0
         for e in range(len(middle)):
-            dx, dy, dz = x - middle[e, 0], y - middle[e, 1], z - middle[e, 2]
-            if dx * dx + dy * dy + dz * dz > (NEAR * reach[e]) ** 2:
+            if _is_far(x - middle[e, 0], y - middle[e, 1], z - middle[e, 2], reach[e]):
                 for q in range(len(weights)):
                     _add_dipole(x - gauss[e, q, 0], y - gauss[e, q, 1], z - gauss[e, q, 2],
                                 dipoles[e, q, 0], dipoles[e, q, 1], dipoles[e, q, 2], total)
-                continue
-            count = 1
-            corners[0] = 0.0
-            corners[0, 1, 0] = corners[0, 2, 1] = corners[0, 3, 2] = 1.0
-            depth[0] = 0
-            while count:
-                count -= 1
-                level = depth[count]
-                a = corners[count].copy()
-                u, v, w = a[:, 0].sum() / 4, a[:, 1].sum() / 4, a[:, 2].sum() / 4
-                _functions(u, v, w, value, slope)
-                dx, dy, dz = (x - _place(places[e], value, 0), y - _place(places[e], value, 1),
-                              z - _place(places[e], value, 2))
-                size = reach[e] / 2.0**level
-                if dx * dx + dy * dy + dz * dz > (NEAR * size) ** 2 or level == DEEPEST:
-                    for q in range(len(weights)):
-                        r = reference[q]
-                        t = 1 - r[0] - r[1] - r[2]
-                        u, v, w = (
-                            t * a[0, 0] + r[0] * a[1, 0] + r[1] * a[2, 0] + r[2] * a[3, 0],
-                            t * a[0, 1] + r[0] * a[1, 1] + r[1] * a[2, 1] + r[2] * a[3, 1],
-                            t * a[0, 2] + r[0] * a[1, 2] + r[1] * a[2, 2] + r[2] * a[3, 2])
-                        _functions(u, v, w, value, slope)
-                        p[:] = 0.0
-                        jacobian[:] = 0.0
-                        for node in range(10):
-                            for i in range(3):
-                                p[i] += value[node] * polarization[e, node, i]
-                                for j in range(3):
-                                    jacobian[i, j] += places[e, node, i] * slope[node, j]
-                        volume = abs(
-                            jacobian[0, 0] * (jacobian[1, 1] * jacobian[2, 2]
-                                              - jacobian[1, 2] * jacobian[2, 1])
-                            - jacobian[0, 1] * (jacobian[1, 0] * jacobian[2, 2]
-                                                - jacobian[1, 2] * jacobian[2, 0])
-                            + jacobian[0, 2] * (jacobian[1, 0] * jacobian[2, 1]
-                                                - jacobian[1, 1] * jacobian[2, 0]))
-                        volume *= weights[q] / 8.0**level
-                        _add_dipole(x - _place(places[e], value, 0),
-                                    y - _place(places[e], value, 1),
-                                    z - _place(places[e], value, 2),
-                                    volume * p[0], volume * p[1], volume * p[2], total)
-                    continue
-                # middles of the edges 01, 02, 03, 12, 13, 23
-                middles[0], middles[1], middles[2] = (
-                    (a[0] + a[1]) / 2, (a[0] + a[2]) / 2, (a[0] + a[3]) / 2)
-                middles[3], middles[4], middles[5] = (
-                    (a[1] + a[2]) / 2, (a[1] + a[3]) / 2, (a[2] + a[3]) / 2)
-                for child in range(8):
-                    for corner in range(4):
-                        source = CHILDREN[child, corner]
-                        if source < 4:
-                            corners[count, corner] = a[source]
-                        else:
-                            corners[count, corner] = middles[source - 4]
-                    depth[count] = level + 1
-                    count += 1
+            else:
+                _add_near(x, y, z, reach[e], places[e], polarization[e], reference, weights, total)
         for i in range(3):
             total[i] /= 4 * pi
 

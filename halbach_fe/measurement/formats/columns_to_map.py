@@ -6,7 +6,7 @@ all missing statements and the options that provide them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import in_a_row
 from halbach_fe.measurement.field_map import (
     MAX_FIELD_T,
+    SIGMA_COLUMNS,
     field_map,
     is_placeholder,
     undirected,
@@ -328,60 +329,75 @@ def _remarks(
     table: ForeignTable, declared: DeclaredFormat
 ) -> list[str]:
     """Return sentences about columns that were recognized though the user did not state them."""
+    said = []
     plain = [column_names.parse(column.text) for column in columns]
     by_axis = [one.text for one, other in zip(plain, column_names.with_axes(plain), strict=True)
                if one != other]
-    said = [f"{_quoted(by_axis)} were read as positions or components, by their axes and units."
-            ] if by_axis and not declared.columns else []
+    if by_axis and not declared.columns:
+        said.append(f"{_quoted(by_axis)} were read as positions or components, by their axes and "
+                    "units.")
     shared = [columns[used[name]].text for name, unit in unit_of.items()
               if name not in column_names.NOISE and not columns[used[name]].unit
               and not declared.unit_of(_kind(name)) and unit != "hhmmss"
               and not (table.length_unit and _kind(name) == "length")]
     if shared:
-        said.append(f"{_quoted(shared)} {'was' if len(shared) == 1 else 'were'} read in the unit "
-                    "of the column beside.")
-    said += ["The columns of H were read as B = mu_0 H, as it is in air."] if any(
-        unit.rpartition(" ")[2] in units.H_FIELDS for unit in unit_of.values()) else []
-    noise = [name for name in column_names.NOISE if name in used]
-    own = any(column.text in ("sigma_T", "sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
-              for column in columns)
+        said.append(f"{_quoted(shared)} {_was(shared)} read in the unit of the column beside.")
+    if any(unit.rpartition(" ")[2] in units.H_FIELDS for unit in unit_of.values()):
+        said.append("The columns of H were read as B = mu_0 H, as it is in air.")
+    noise = {name: columns[used[name]].text for name in column_names.NOISE if name in used}
+    own = any(column.text in ("sigma_T", *SIGMA_COLUMNS) for column in columns)
     if noise and not declared.columns and not own:
-        shown = " and ".join(f"'{columns[used[name]].text}' (in {unit_of[name]})" for name in noise)
-        said.append(
-            f"{shown} {'was' if len(noise) == 1 else 'were'} read as the standard deviation of "
-            + ("all components" if noise == ["sigma"] else "the components in the names")
-            + ", which takes the place of the study's noise; if that is wrong, ignore "
-            f"{'it' if len(noise) == 1 else 'them'} by - in --columns.")
-    if {"sigma_Br", "sigma_Bphi"} & set(noise):
+        said.append(_noise_in_words(noise, unit_of))
+    if {"sigma_Br", "sigma_Bphi"} & {*noise}:
         said.append("The standard deviations of Br and Bphi were turned into those of Bx and By, "
                     "as if errors of Bx and By were independent.")
     if "theta" in used:
         said.append("theta was read as the angle from the z axis, and phi as that about it; if it "
                     "is the other way round, exchange them in --columns.")
-    for index, column in enumerate(columns):
-        if index in used.values() or not column.text or (
-                declared.columns and declared.columns[index].strip() == "-"):
-            continue
-        values = table.values[:, index]
-        if column_names.is_imaginary(column.text) and np.nan_to_num(values).any():
-            said.append(f"'{column.text}' is not zero, up to {np.nanmax(np.abs(values)):.4g}: of a "
-                        "field that changes in time only the real part was read.")
-        elif column_names.is_time(column):
-            why = "their unit is not stated"
-            if "t" in used:
-                said.append(f"The times in '{column.text}' are not used: those in "
-                            f"'{columns[used['t']].text}' are.")
-                continue
-            if table.texts.get(index):
-                why = "they are neither times of day HH:MM:SS nor stamps 2024-05-31T14:23:59"
-            elif look_like_clock(values):
-                why += " (they look like HHMMSS)"
-            said.append(f"The times in '{column.text}' are not used, as {why}: state "
-                        "t[s], t[min], t[h] or t[hhmmss] in its place in --columns.")
-        elif column_names.noise_of(column.text, column.text.lower()) in column_names.POSITIONS:
-            said.append(f"The uncertainty of positions in '{column.text}' is not used: "
-                        "state noise.position_sd_m in the study.")
-    return said
+    ignored = {index for index, text in enumerate(declared.columns) if text.strip() == "-"}
+    times = columns[used["t"]].text if "t" in used else ""
+    unused = (_unused_in_words(column, table, index, times) for index, column in enumerate(columns)
+              if column.text and index not in {*used.values(), *ignored})
+    return [*said, *filter(None, unused)]
+
+
+def _was(columns: Sized) -> str:
+    """Return the verb of a sentence about one column, or about several."""
+    return "was" if len(columns) == 1 else "were"
+
+
+def _noise_in_words(noise: dict[str, str], unit_of: dict[str, str]) -> str:
+    """Say which columns, by what they were read as, were read as the noise of the readings."""
+    shown = " and ".join(f"'{text}' (in {unit_of[name]})" for name, text in noise.items())
+    whose = "all components" if [*noise] == ["sigma"] else "the components in the names"
+    return (f"{shown} {_was(noise)} read as the standard deviation of {whose}, which takes the "
+            "place of the study's noise; if that is wrong, ignore "
+            f"{'it' if len(noise) == 1 else 'them'} by - in --columns.")
+
+
+def _unused_in_words(column: ColumnName, table: ForeignTable, index: int, times: str) -> str:
+    """Say what a column that is not used would tell; empty if it is nothing of a map.
+
+    ``times`` is the name of the column from which times are read, if there is one.
+    """
+    values = table.values[:, index]
+    if column_names.is_imaginary(column.text) and np.nan_to_num(values).any():
+        return (f"'{column.text}' is not zero, up to {np.nanmax(np.abs(values)):.4g}: of a field "
+                "that changes in time only the real part was read.")
+    if column_names.is_time(column):
+        if times:
+            return f"The times in '{column.text}' are not used: those in '{times}' are."
+        why = "their unit is not stated"
+        if table.texts.get(index):
+            why = "they are neither times of day HH:MM:SS nor stamps 2024-05-31T14:23:59"
+        elif look_like_clock(values):
+            why += " (they look like HHMMSS)"
+        return (f"The times in '{column.text}' are not used, as {why}: state t[s], t[min], t[h] or "
+                "t[hhmmss] in its place in --columns.")
+    if column_names.noise_of(column.text, column.text.lower()) in column_names.POSITIONS:
+        return (f"The uncertainty of positions in '{column.text}' is not used: state "
+                "noise.position_sd_m in the study.")
+    return ""
 
 
 def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[ColumnName, ...]:
