@@ -32,7 +32,7 @@ from halbach_fe.measurement.positions import follows_times
 from halbach_fe.measurement.probe_law import in_si_and_magnet_axes, turn_of
 from halbach_fe.study.inference_keys import InstrumentSd
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import MIN_SIGMA_T
+from halbach_fe.study.types import COMPONENTS, MIN_SIGMA_T
 
 Data = xr.Dataset | Mapping[str, xr.Dataset]
 """The only map, or the maps that a study lists, by name."""
@@ -268,6 +268,27 @@ def _refuse_copies(name: str, data: xr.Dataset, study: Study) -> None:
             "readings must not count twice", f"{count} of {len(points)} rows that are another row "
             f"again, but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that all "
             "share", "Remove the copies; repeated measurements differ by their noise, too."))
+    for axis, component in enumerate(COMPONENTS):
+        count, pairs = _mirrored(points, blank, axis)
+        if count > SHARED * pairs and _no_chance(count, pairs, field, noise):
+            warnings.warn(
+                f"{count} of {len(points)} rows of `{name}` of study {study.name} are others "
+                f"mirrored along {component}, digit for digit but for signs. If symmetry made "
+                "them, and no probe, leave them out: they count twice, and hide what is not "
+                "symmetric in the magnet.", HalbachWarning, stacklevel=2)
+
+
+def _mirrored(points: Floats, field: Floats, axis: int) -> tuple[int, int]:
+    """Return how many rows are others mirrored in the middle of the map along an axis.
+
+    Signs of components do not matter. The second number is that of all pairs of such places.
+    """
+    image = points.copy()
+    image[:, axis] = points[:, axis].min() + points[:, axis].max() - points[:, axis]
+    distance, other = KDTree(points).query(image, distance_upper_bound=SAME_PLACE_M)
+    first = np.flatnonzero(np.isfinite(distance) & (other > np.arange(len(points))))
+    alike = (np.abs(field[first]) == np.abs(field[other[first]])).all(axis=1)
+    return int(alike.sum()), len(first)
 
 
 def _copies_with_offset(points: Floats, field: Floats, noise: float) -> tuple[int, Floats]:

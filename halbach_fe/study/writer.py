@@ -399,8 +399,10 @@ def _ends(magnet: MagnetTemplate, table: FreeBlocks | None) -> tuple[float, floa
     if table is not None:
         z, half = table.numbers("z_m", 0.0), table.numbers("size_z_m", 0.0) / 2
         return (float((z - half).min()), float((z + half).max())) if table.size_z_m else None
-    end = magnet.rings * (magnet.ring_length_m or 0.0) / 2
-    return (-end, end) if end else None
+    if magnet.ring_length_m is None:
+        return None
+    end = magnet.rings * magnet.ring_length_m / 2
+    return -end, end
 
 
 def parse_new_study(text: str, folder: Path = Path(), table: FreeBlocks | None = None) -> Study:

@@ -345,6 +345,10 @@ def test_a_study_of_keys_names_all_that_are_missing():
      "rings .* at least 1"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, recoil_permeability=0),
      "recoil_permeability"),
+    # a ring without length was a cross-section, and a grade without a name one of 1.3 T
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.0),
+     "ring_length_m"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, material=""), "material"),
     (lambda: hf.magnet_of_blocks({"shape": ["cuboid"], "x_m": [0.0]}), "y_m"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([1, 2]), "x, y, z"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([0.03, 0, 0]),

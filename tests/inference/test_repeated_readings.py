@@ -68,6 +68,23 @@ def test_rows_that_come_again_with_other_times(generator):
         maps_of(study(), twice(single, single))
 
 
+def test_a_part_that_was_mirrored_to_a_whole(generator):
+    """Three quarters that symmetry made are no readings. Control: a symmetric magnet that was read.
+
+    Signs of components are those of a dipole along x.
+    """
+    symmetric = np.column_stack([0.1 + GRID[:, 0]**2, GRID[:, 0] * GRID[:, 1], GRID[:, 0]])
+    measured = read(generator, field=symmetric)
+    maps_of(study(), field_map(GRID, measured))
+    quarter = (GRID[:, 0] > 0) & (GRID[:, 1] > 0)
+    signs = [(x, y) for x in (1, -1) for y in (1, -1)]
+    whole = field_map(np.vstack([GRID[quarter] * [x, y, 1] for x, y in signs]),
+                      np.vstack([measured[quarter] * [1, x * y, x] for x, y in signs]))
+    with pytest.warns(HalbachWarning, match="320 of 640 rows .* mirrored along [xy]") as told:
+        maps_of(study(), whole)
+    assert len(told) == 2
+
+
 @pytest.mark.parametrize("digits", [4, 5])
 @pytest.mark.parametrize("noise", [SIGMA, SIGMA / 10])
 def test_few_digits_repeat_by_chance(generator, digits, noise):
