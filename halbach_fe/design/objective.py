@@ -132,7 +132,7 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     ``about`` (parameters,) in A/m: magnetizations of that magnet, which those of neighbours' blocks
     may follow; by default the nominal ones.
     """
-    response, others = model.response, model.of_neighbours
+    response, others = model.response, model.response.of_neighbours
     inner = np.flatnonzero(model.weights > 0)
     weights = model.weights[inner]
     rows = (3 * inner[:, None] + np.arange(3)).ravel()

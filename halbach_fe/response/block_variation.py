@@ -41,7 +41,12 @@ from halbach_fe.solver.exact_block_field import external_field, field_of, unit_f
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.moments.solve import solve_moments
-from halbach_fe.solver.routes import finite_element_part, solve_nominal, vacuum_part
+from halbach_fe.solver.routes import (
+    fields_of_others,
+    finite_element_part,
+    solve_nominal,
+    vacuum_part,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import (
     Gaussian,
@@ -261,13 +266,15 @@ def neighbour_remanences(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], 
             for one in magnet.study.external.neighbours]
 
 
-def neighbour_columns(magnet: Magnet, points: Floats) -> Floats:
+def neighbour_columns(magnet: Magnet, points: Floats, session: Session | None = None) -> Floats:
     """Return B (n, 3, parameters) in T at points (n, 3) in m per A/m of the parameters of
-    `neighbour_prior`.
+    `neighbour_prior`, in vacuum or, by a ``session``, with what iron answers.
     """
     return np.concatenate([np.zeros((*points.shape, 0)), *(
         unit @ matrix for blocks, matrices in neighbour_remanences(magnet)
-        for unit, matrix in zip(unit_fields(blocks, points), matrices, strict=True))], axis=2)
+        for unit, matrix in zip(
+            unit_fields(blocks, points) if session is None else fields_of_others(
+                magnet, blocks, points, session), matrices, strict=True))], axis=2)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:
