@@ -399,10 +399,10 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
     off = float(np.linalg.norm(distribution.mean[:len(nominal)] - nominal))
     doubted = 1.2  # times nominal; none magnetized is 1, a third of the blocks upside down 1.15
     if off > doubted * np.linalg.norm(nominal) > 0:
-        warnings.warn(f"In `{name}` the blocks of magnet {magnet.name} are farther from the "
-                      "nominal ones than if none were magnetized, by "
-                      f"{off / np.linalg.norm(nominal):.0%} of these. Is it of another magnet?",
-                      HalbachWarning, stacklevel=2)
+        warnings.warn(f"As they were given or found, the blocks of magnet {magnet.name} are "
+                      "farther from the nominal ones than if none were magnetized, by "
+                      f"{off / np.linalg.norm(nominal):.0%} of these. Are they, or the map, of "
+                      "another magnet?", HalbachWarning, stacklevel=2)
     return magnetized(magnet, with_neighbours(magnet, distribution), name)
 
 
