@@ -12,7 +12,7 @@ Deviations are those of the component along the main field, which is linear in t
 differs from |B| by the square of the components across it. Its extremes lie on the surface of the
 region, as it is a harmonic function there. Permeable blocks are taken as they are in vacuum while
 the search runs; then their reaction in the design that was found is added to every design, and the
-search goes on from there.
+search goes on from there. What is said of a design has its own.
 
 Radii between those of the catalogue are found by a sequence of linear programs (`moved_radii`). For
 small moves of the rings the field at every point is linear in them. The moves within a trust region
@@ -46,6 +46,7 @@ from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
     RingOfBlocks,
+    about_origin,
     design_of,
     designed,
     fields_with_images,
@@ -67,6 +68,9 @@ MISSES = 1e9
 
 TINY_T = 1e-12
 """Mean field below which there is none."""
+
+ROUNDING = 1e-9
+"""Part of a least field by which rounding may miss it."""
 
 
 @dataclass(frozen=True)
@@ -465,7 +469,7 @@ def design_rings(
     """
     check_number("seed", "design_rings", seed, 0, whole=True)
     design_of(study)  # refuses other magnets, whose array has no rings
-    region = region or default_region(build_magnet(study))
+    region = region or default_region(about_origin(study))
     catalogue = Catalogue.of(study, region, _density(study))
     design, generator = catalogue.design, np.random.default_rng(seed)
     direction = catalogue.sample.direction
@@ -484,7 +488,7 @@ def design_rings(
     rounds = 3  # largest number of searches with the reaction of permeable blocks
     for _ in range(rounds):
         chosen = found.chosen
-        reaction = _reaction(catalogue, chosen, session)
+        reaction = _reaction(catalogue, catalogue.rings(chosen), session)
         if not reaction.any():
             break
         task = task_of(catalogue, reaction @ direction)
@@ -495,18 +499,21 @@ def design_rings(
                   for one in (found, *_front(task, found, generator))}.values())
     # the search for more field may find a better design
     number = int(np.argmin([one.ppm for one in every]))
-    found = every[number]
-    if number:
-        reaction = _reaction(catalogue, found.chosen, session)
-    reached = found.ppm < MISSES
+    reached = every[number].ppm < MISSES
     # the search worked for the component along the main field, at points
-    judged = [_judged(catalogue, region, catalogue.rings(one.chosen), reaction)
+    judged = [_judged(catalogue, region, catalogue.rings(one.chosen), session)
               for one in every if not reached or one.ppm < MISSES]
-    best = judged[number] if not reached else _least(judged, design.objective)
+    # the reaction that it took for all may have made one stronger than it is
+    least = (design.least_field_T or 0.0) * (1 - ROUNDING)
+    enough = [one for one in judged if one.mean_T >= least]
+    best = _least(enough, design.objective) if reached and enough else judged[number]
+    reached = reached and bool(enough)
     if design.between_radii:
         moved = _judged(catalogue, region, moved_radii(
-            catalogue, best.rings, reaction @ direction, task), reaction)
-        best = moved if not reached else _least([moved, best], design.objective)
+            catalogue, best.rings, _reaction(catalogue, best.rings, session) @ direction, task),
+            session)
+        best = moved if not reached else _least([best, *(
+            [moved] if moved.mean_T >= least else [])], design.objective)
     # what is asked of the study next, such as its tolerances, is asked of the same region
     result = designed(study, tables_of(study, catalogue.z_m, best.rings)).with_(
         homogeneity=region.table)
@@ -536,12 +543,15 @@ def _density(study: Study) -> float:
     return float(np.mean(grade(str(name)).density_kg_per_m3)) if name else DENSITY_KG_PER_M3
 
 
-def _reaction(catalogue: Catalogue, chosen: Ints, session: Session) -> Floats:
+def _magnet(catalogue: Catalogue, rings: tuple[Option, ...]) -> Magnet:
+    """Return the magnet of a design."""
+    return build_magnet(designed(catalogue.study, tables_of(
+        catalogue.study, catalogue.z_m, rings)))
+
+
+def _reaction(catalogue: Catalogue, rings: tuple[Option, ...], session: Session) -> Floats:
     """Return what permeability adds to B (k, 3) in T at the points of the catalogue's sample."""
-    study = designed(catalogue.study, tables_of(catalogue.study, catalogue.z_m,
-                                                catalogue.rings(chosen)))
-    magnet, sample = build_magnet(study), catalogue.sample
-    return _added(magnet, sample.points, session)
+    return _added(_magnet(catalogue, rings), catalogue.sample.points, session)
 
 
 def _added(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -560,10 +570,9 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
     levels = 6
     # number of random changes for each design of larger field: it begins near a good one
     restarts = 60
-    rounding = 1e-9  # part of a least field by which rounding may miss it
     for step in range(1, levels):
         level = max(start + (end - start) * (step / levels)**2, task.least_field_T)
-        harder = replace(task, least_field_T=level * (1 - rounding))
+        harder = replace(task, least_field_T=level * (1 - ROUNDING))
         last = min((search(harder, one, restarts, generator)
                     for one in (last.chosen, strongest)), key=lambda one: one.ppm)
         if last.ppm < MISSES:
@@ -572,16 +581,15 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
 
 
 def _judged(
-    catalogue: Catalogue, region: Region, rings: tuple[Option, ...], reaction: Floats
+    catalogue: Catalogue, region: Region, rings: tuple[Option, ...], session: Session
 ) -> RingDesign:
-    """Return a design with its field, to which permeability adds ``reaction`` (k, 3) in T.
+    """Return a design with its field, and what permeability adds to it.
 
     By how much the extremes exceed those at the points of the catalogue's sample is found from the
     field in vacuum.
     """
-    sample = catalogue.sample
-    magnet = build_magnet(designed(catalogue.study, tables_of(
-        catalogue.study, catalogue.z_m, rings)))
+    sample, magnet = catalogue.sample, _magnet(catalogue, rings)
+    reaction = _added(magnet, sample.points, session)
     vacuum = field_of(magnet.blocks, sample.points)
     bare, size = (np.linalg.norm(field, axis=1) for field in (vacuum, vacuum + reaction))
     near = region_points(magnet, region)

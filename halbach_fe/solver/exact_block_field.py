@@ -59,7 +59,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, ring_radii
 from halbach_fe.solver.field_kernels import arc_table, cuboid_fields, outline_fields
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.study.external import AnyCoil, Neighbour, Racetrack, RoundCoil, check_apart
+from halbach_fe.study.external_keys import AnyCoil, Neighbour, Racetrack, RoundCoil, check_apart
 from halbach_fe.study.materials import MU_0
 
 _AT_ONCE = 100_000
@@ -608,46 +608,68 @@ def _half(coil: Racetrack, side: int, sign: int) -> tuple[Racetrack, Floats]:
     return coil.model_copy(update=changes), np.array([0.0, 0.0, side * offset])
 
 
-def _filaments(coil: Racetrack, chords: int) -> tuple[Floats, Floats]:
-    """Return closed filaments: their shares (k,) of the current, and corners (k, m, 3) in m."""
+def _filaments(
+    coil: Racetrack, chords: int, counts: tuple[int, int] = (4, 4)
+) -> tuple[Floats, Floats]:
+    """Return closed filaments: their shares (k,) of the current, and corners (k, m, 3) in m.
+
+    ``counts`` are those of filaments across the turns and along z.
+    """
     shares, found = [], []
-    for across, share in zip(*_gauss(coil.section_m[0], 4), strict=True):
+    for across, share in zip(*_gauss(coil.section_m[0], counts[0]), strict=True):
         turn = turn_corners(coil, across, chords)
-        for height, part in zip(*_gauss(coil.section_m[1], 4), strict=True):
+        for height, part in zip(*_gauss(coil.section_m[1], counts[1]), strict=True):
             shares.append(share * part)
             found.append(turn + np.array([0.0, 0.0, height]))
     return np.array(shares), np.array(found)
 
 
-def current_elements(coil: AnyCoil) -> tuple[Floats, Floats]:
-    """Return places (n, 3) in m of pieces of a coil and I dl (n, 3) in A m, for forces on it."""
-    longest = 1 / 100  # part of a turn that a piece may be
+def current_elements(coil: AnyCoil, longest: float) -> tuple[Floats, Floats]:
+    """Return places (n, 3) in m of pieces of a coil and I dl (n, 3) in A m, for forces on it.
+
+    Pieces are at most ``longest`` in m, and Gauss points of the section as near to each other in
+    the mean; both are larger where there would be too many.
+    """
+    most, part = 40_000, 1 / 100  # number of pieces, and part of a turn that one may be
+    sides = (0.0, 0.0) if coil.kind == "polygon" else coil.section_m
+    if coil.kind == "round":
+        line = coil.radius_m * unit_circle(np.linspace(0, 2 * np.pi, 101))
+    else:
+        line = closed_polygon(coil) if coil.kind == "polygon" else turn_corners(coil, 0.0, 12)
+    turn = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    longest = max(longest, turn / most)
+    while True:
+        piece = min(longest, part * turn)
+        across, along = (max(4, int(np.ceil(side / longest))) if side else 1 for side in sides)
+        if turn / piece * across * along <= most:
+            break
+        longest *= 1.1
     turns: Sequence[Floats] | Floats
     if coil.kind == "polygon":
-        shares, turns = np.ones(1), [closed_polygon(coil)]
+        shares, turns = np.ones(1), [line]
     elif coil.kind == "racetrack":
-        shares, turns = _filaments(coil, 12)
+        shares, turns = _filaments(coil, 12, (across, along))
     else:
-        angle = np.linspace(0, 2 * np.pi, round(1 / longest) + 1)
+        angle = np.linspace(0, 2 * np.pi, round(turn / piece) + 1)
         circle = unit_circle(angle)
         # a polygon of the same area
         circle *= np.sqrt(angle[1] / np.sin(angle[1]))
-        rules = [_gauss(side, 4) for side in coil.section_m]
+        rules = _gauss(sides[0], across), _gauss(sides[1], along)
         shares = np.outer(*(rule[1] for rule in rules)).ravel()
-        turns = [(coil.radius_m + across) * circle + np.array([0.0, 0.0, height])
-                 for across in rules[0][0] for height in rules[1][0]]
-    places, along = [], []
-    for share, turn in zip(shares, turns, strict=True):
-        sides = np.diff(turn, axis=0)
-        lengths = np.linalg.norm(sides, axis=1)
-        counts = np.maximum(np.ceil(lengths / (longest * lengths.sum())).astype(int), 1)
-        number = np.repeat(np.arange(len(sides)), counts)
+        turns = [(coil.radius_m + off) * circle + np.array([0.0, 0.0, height])
+                 for off in rules[0][0] for height in rules[1][0]]
+    places, currents = [], []
+    for share, one in zip(shares, turns, strict=True):
+        parts = np.diff(one, axis=0)
+        lengths = np.linalg.norm(parts, axis=1)
+        counts = np.maximum(np.ceil(lengths / (piece / turn * lengths.sum())).astype(int), 1)
+        number = np.repeat(np.arange(len(parts)), counts)
         within = (np.arange(len(number)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5)
-        places.append(turn[number] + (within / counts[number])[:, None] * sides[number])
-        along.append(share * sides[number] / counts[number][:, None])
+        places.append(one[number] + (within / counts[number])[:, None] * parts[number])
+        currents.append(share * parts[number] / counts[number][:, None])
     axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
     return (np.vstack(places) @ axes.T + coil.centre_m,
-            coil.current_A * coil.turns * np.vstack(along) @ axes.T)
+            coil.current_A * coil.turns * np.vstack(currents) @ axes.T)
 
 
 def _straight(shares: Floats, corners: Floats, points: Floats) -> Floats:

@@ -13,12 +13,13 @@ import warnings
 from dataclasses import replace
 
 import gmsh
+import numpy as np
 import pytest
 import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.cli.guard import guarded
-from halbach_fe.cli.options import orders
+from halbach_fe.cli.shared_options import orders
 from halbach_fe.cli.verbs import with_values
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.core.files import InputFile
@@ -632,7 +633,7 @@ def test_advice_for_a_held_out_map_in_mt_works(campaign, tmp_path, capsys):
     """Beside a map in T. The key of the study, which was advised, has both in its unit."""
     study, measured, _ = campaign
     magnet = build_magnet(read_study(study))
-    points = points_from(magnet.study.observation.positions) + [0.0, 0.0, 1e-4]
+    points = points_from(magnet.study.observation.positions) + np.array([0.0, 0.0, 1e-4])
     held = tmp_path / "held.csv"
     write_map(field_map(points, 1e3 * field_of(magnet.blocks, points)), held)
 

@@ -18,9 +18,9 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_mesh import Sizes
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.forces import forces_figure, page, round_below
+from halbach_fe.report.forces_page import forces_figure, page, round_below
 from halbach_fe.report.page import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
@@ -355,19 +355,25 @@ def test_two_spheres_pull_one_another(tmp_path):
     assert shown.summary["iron"][0]["force_N"][2] == found.iron.force_N[0, 2]
 
 
-@pytest.mark.filterwarnings("ignore:.*leave 0.4.. m between each other along z")
-def test_a_coil_pulls_a_sphere(tmp_path):
-    """As the dipole that its field induces is pulled: alpha grad B^2 / (2 mu_0)."""
-    coil = {"kind": "round", "radius_m": 0.05, "section_m": [0.0, 0.0], "current_A": 1e4,
-            "centre_m": [0.0, 0.0, 0.4]}
+@pytest.mark.parametrize("length", [0.0, 0.3])
+@pytest.mark.filterwarnings("ignore:.*leave 0.... m between each other along z")
+def test_a_coil_pulls_a_sphere(tmp_path, length):
+    """As the dipole that its field induces is pulled: alpha grad B^2 / (2 mu_0). A solenoid that is
+    much longer than it is wide does so near its end.
+    """
+    coil = {"kind": "round", "radius_m": 0.05, "section_m": [0.0, length], "current_A": 1e4,
+            "centre_m": [0.0, 0.0, 0.4 + length / 2]}
     sphere = {"kind": "sphere", "radius_m": 0.005, "centre_m": [0.0, 0.0, 0.44]}
     found = found_of(beside(sphere, external={"coils": [coil]}, growth=1.8), tmp_path)
     z = 0.04 + np.array([-1e-5, 1e-5])
     field = MU_0 * 1e4 * 0.05**2 / 2 / (0.05**2 + z**2) ** 1.5
+    if length:
+        field = MU_0 * 1e4 / 2 / length * (
+            z / np.hypot(0.05, z) - (z - length) / np.hypot(0.05, z - length))
     force = 4 * np.pi * 0.005**3 * np.diff(field**2)[0] / 2e-5 / 2 / MU_0
     # the field is not quite uniform over the sphere: (a / R)^2 is 1 %
     assert found.iron.force_N[0] == pytest.approx([0, 0, force], abs=0.05 * abs(force))
-    assert force < 0
+    assert (force < 0) == (not length)
 
 
 def test_bodies_that_no_plane_separates_feel_one_force(tmp_path, monkeypatch):
