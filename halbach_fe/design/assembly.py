@@ -26,8 +26,8 @@ from halbach_fe.study.array_keys import block_name
 from halbach_fe.study.design_keys import Holder
 from halbach_fe.study.free_blocks import SIZES
 
-TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")
-"""Shapes that are the same after half a turn about their x axis."""
+_TURNS = tuple(Rotation.create_group("O").as_matrix().round())
+"""The 24 rotations that bring a cube onto itself."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,25 @@ class Kind:
         steps = np.round(self.direction / np.radians(same_deg)) + 0.0
         return (tuple((column, _rounded(value)) for column, value in self.sizes.items()),
                 self.material, tuple(steps.tolist()), round(self.remanence_T, 6))
+
+    @property
+    def part(self) -> tuple[object, ...]:
+        """The first `identity` of the block in all positions in which its outline is the same: a
+        cube has 24, a cylinder any about its axis, and all but prisms are alike upside down.
+        """
+        sizes, direction = self.sizes, self.direction
+        if sizes["shape"] == "prism":
+            return self.identity
+        if sizes["shape"] == "cylinder":
+            direction = np.array([np.hypot(*direction[:2]), 0.0, direction[2]])
+        if sizes["shape"] != "cuboid":
+            return min(replace(self, direction=direction * sign).identity
+                       for sign in ([1, 1, 1], [1, -1, -1]))
+        sides = ("size_x_m", "size_y_m", "size_z_m")
+        lengths = np.array([sizes[side] for side in sides])
+        return min(replace(self, direction=turn @ direction, sizes=sizes | dict(
+            zip(sides, (np.abs(turn) @ lengths).tolist(), strict=True))).identity
+            for turn in _TURNS)
 
     @property
     def shape(self) -> str:
@@ -213,20 +232,11 @@ class Assembly(ShownInNotebook):
 
     @property
     def ordered_as(self) -> tuple[int, ...]:
-        """For each kind the number of the first kind that is the same block, perhaps its own.
-
-        Blocks of most shapes fit into the same place if they are turned by 180 degrees about their
-        x axis, which reverses the magnetization along y and z.
+        """For each kind the number of the first kind that is the same `Kind.part`, turned over or
+        about; perhaps its own.
         """
         first: dict[object, int] = {}
-        found = []
-        for kind in self.kinds:
-            same = kind
-            if kind.sizes["shape"] in TURNED_ALIKE:
-                same = replace(kind, direction=kind.direction * [1, -1, -1])
-            number = first.get(same.identity, kind.number)
-            found.append(first.setdefault(kind.identity, number))
-        return tuple(found)
+        return tuple(first.setdefault(kind.part, kind.number) for kind in self.kinds)
 
 
 @typed

@@ -34,7 +34,7 @@ from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.campaign_readings import Readings, read_campaign
-from halbach_fe.inference.infer import neighbour_readings, seen_columns
+from halbach_fe.inference.infer import seen_columns
 from halbach_fe.inference.relinearization import open_columns
 from halbach_fe.measurement.campaign_maps import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
@@ -158,16 +158,16 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     readings, one, field = _readings(magnet, points, session.within("instrument"))
     observation = readings.observation
     model = response_matrix(magnet, observation, session)
-    beside, neighbours = (_beside(readings, one, field, model.shared_error),
-                          neighbour_readings(magnet, [one], readings))
+    beside = _beside(readings, one, field, model.shared_error)
     errors = readings.noise.with_independent_errors(model.error)
     prior = study_prior(magnet, len(model.parameters))
     everything = with_variations(prior.stacked, beside.shape[1])
-    whole = np.hstack([model.whole, neighbours, beside])
+    whole = np.hstack([model.whole, model.of_neighbours, beside])
     size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(whole @ everything.root).reshape(len(points), size, -1)
     others = errors.whiten(np.hstack([beside, seen_columns(
-        neighbours @ neighbour_prior(magnet).root, readings)])).reshape(len(points), size, -1)
+        model.of_neighbours @ neighbour_prior(magnet).root, readings)])).reshape(
+            len(points), size, -1)
     values = _values(magnet, prior, session.within("objective"))
     root = np.zeros((0, whitened.shape[2])) if values is None else np.pad(
         values.root, ((0, 0), (0, beside.shape[1])))

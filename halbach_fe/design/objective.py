@@ -132,7 +132,7 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
     ``about`` (parameters,) in A/m: magnetizations of that magnet, which those of neighbours' blocks
     may follow; by default the nominal ones.
     """
-    response, others = model.response, model.of_neighbours
+    response, others = model.response, model.response.of_neighbours
     inner = np.flatnonzero(model.weights > 0)
     weights = model.weights[inner]
     rows = (3 * inner[:, None] + np.arange(3)).ravel()
@@ -245,7 +245,8 @@ def objective_of(
                 f"the multipole of order {model.main}", f"study {magnet.name}",
                 f"above {least_main:g} of what the blocks could make together, as others are in "
                 "units of 1e-4 of it", f"{model.nominal_main / blocks:.2g}",
-                "Check multipole_order; of an undulator, ask on a circle at a pole: --at-z-m Z."))
+                magnet.axis_beside or "Check multipole_order; of an undulator, ask on a circle at "
+                "a pole: --at-z-m Z."))
         return model
     region = homogeneity_model(magnet, default_region(magnet), session)
     field = region.field(region.response.nominal[:, None])[..., 0]

@@ -304,6 +304,19 @@ class Magnet(ShownInNotebook):
             return float(x), float(y), self.middle_z_m
         return 0.0, 0.0, self.middle_z_m
 
+    @property
+    def axis_beside(self) -> str:
+        """Advice if the z axis, about which multipoles are, lies beside the blocks; else empty."""
+        x, y, _ = self.middle_m
+        if not (x or y):
+            return ""
+        change = [round(-each, 7) + 0.0 for each in (x, y)]
+        rows = " and ".join(f"{each:g} to {axis}_m" for each, axis in zip(
+            change, "xy", strict=True) if each)
+        return (f"The blocks lie around an axis at x = {x:.4g} and y = {y:.4g} m, beside the z "
+                f"axis: add {rows} of the table, move what else the study places, and read its "
+                f"maps by instrument.translation_m = [{change[0]:g}, {change[1]:g}, 0.0].")
+
     @cached_property
     def bore_radius(self) -> float:
         """Radius in m of the largest cylinder along z about `middle_m` that the blocks leave free.
@@ -557,14 +570,10 @@ def _doubt_metres(magnet: Magnet) -> None:
 
 def _doubt_axis(magnet: Magnet) -> None:
     """Warn of blocks around another axis than the z axis, about which all is that turns."""
-    x, y, _ = magnet.middle_m
-    if x or y:
+    if magnet.axis_beside:
         warnings.warn(
-            f"Blocks of {magnet.name} lie around an axis at x = {x:.4g} and y = {y:.4g} m. "
-            "Multipoles, circles, rolls, turns of rings and radial displacements are about the z "
-            f"axis, which lies beside them: add {-x:.4g} to x_m and {-y:.4g} to y_m of the table, "
-            f"and read its maps by instrument.translation_m = [{-x:.4g}, {-y:.4g}, 0.0].",
-            HalbachWarning, stacklevel=3)
+            f"Multipoles, circles, rolls, turns of rings and radial displacements of {magnet.name} "
+            f"are about the z axis. {magnet.axis_beside}", HalbachWarning, stacklevel=3)
 
 
 def _doubt_iron(magnet: Magnet) -> None:

@@ -141,6 +141,7 @@ class Readings:
         # error bars of a component are already those of the vector at its point
         return replace(model, matrix=matrix, offset=self.projection @ model.offset,
                        error=model.error[self.first],
+                       of_neighbours=self.projection @ model.of_neighbours,
                        shared_error=(self.projection @ model.shared_error.T).T)
 
     @property

@@ -350,7 +350,7 @@ class _Search:
         prior = self._prior_of_blocks(len(model.parameters)).stacked
         if len(prior.mean) > len(model.parameters):
             prior = replace(prior, root=stacked_root(prior.root))  # of an earlier update, too
-            matrix = Beside(matrix, neighbour_readings(self.magnet, self.maps, readings))
+            matrix = Beside(matrix, model.of_neighbours)
         exact, of_field = matrix, matrix
         for of, columns, mean, sd in self._beside(readings):
             matrix, prior = Beside(matrix, columns), with_independent(prior, mean, sd)
@@ -456,19 +456,19 @@ def _unit_prior(columns: Floats) -> tuple[Floats, Floats]:
     return np.zeros(columns.shape[1]), np.ones(columns.shape[1])
 
 
-def neighbour_readings(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+def _in_vacuum(magnet: Magnet, maps: Sequence[Map], observation: Observation) -> Floats:
     """Return readings (n, k) in T per A/m of what the magnetizations of neighbours' blocks
-    deviate.
+    deviate, without what iron answers.
     """
     if not magnet.study.external.neighbours:
-        return np.zeros((len(readings.values), 0))
+        return np.zeros((len(observation), 0))
     found = []
     for one in maps:
         instrument = one.study.instrument
         points = probe_points(instrument, points_of(in_si_and_magnet_axes(instrument, one.data)))
         found.append(np.moveaxis(neighbour_columns(magnet, points), 2, 0)
                      @ sensor_matrix(instrument).T)
-    return readings.observation.read(np.concatenate(found, axis=1)).T
+    return observation.read(np.concatenate(found, axis=1)).T
 
 
 def seen_columns(columns: Floats, readings: Readings) -> Floats:
@@ -608,12 +608,15 @@ class _Solved:
     def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
         """Return the response of `Readings.vectors` after small changes of the terms.
 
-        Its matrix is the same. Its offset contains what the changes do to the readings of the
-        magnet as it is estimated.
+        Its matrix is the same, but for neighbours' blocks in vacuum. Its offset contains what the
+        changes do to the readings of the magnet as it is estimated.
         """
-        change = (readings_of_field(estimate.field, maps, readings.vectors) - self.nominal
-                  - readings_of_field(estimate.own, self.maps, readings.vectors))
-        return replace(self.response, offset=self.response.offset + change)
+        magnet, vectors = estimate.of_deviations.magnet, readings.vectors
+        others = _in_vacuum(magnet, maps, vectors) - _in_vacuum(magnet, self.maps, vectors)
+        change = (readings_of_field(estimate.field, maps, vectors) - self.nominal
+                  - readings_of_field(estimate.own, self.maps, vectors))
+        return replace(self.response, offset=self.response.offset + change,
+                       of_neighbours=self.response.of_neighbours + others)
 
 
 def _poses(open_terms: OpenTerms, maps: Sequence[Map], posterior: Gaussian) -> tuple[MapPose, ...]:

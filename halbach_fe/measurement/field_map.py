@@ -804,8 +804,9 @@ def check_magnitudes(data: xr.Dataset) -> None:
     if farthest > 10 * MAX_LENGTH_M:
         raise MeasurementError(must_be(
             "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
-            "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study, or "
-            "name the columns x_mm, y_mm, z_mm and convert the map by halbach-fe import-map."))
+            "Are they in millimetres? Then name the columns x_mm, y_mm, z_mm and convert the map "
+            "by halbach-fe import-map or, if all maps of the study are so, the held-out one too, "
+            "set instrument.length_unit_m = 0.001 in it."))
     values, sigmas = data["B_T"].values, data.get("sigma_T")
     if is_total_field(data):
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
@@ -821,8 +822,9 @@ def check_magnitudes(data: xr.Dataset) -> None:
         some = "" if (wrong | (by_component == 0)).all() else " and ".join(
             column for column, too_large in zip(FIELD_COLUMNS, wrong, strict=True) if too_large)
         units = (
-            f"in {unit}? Then set instrument.flux_density_unit_T = {factor} in the "
-            f"study, or name the columns {columns} and convert the map by halbach-fe import-map.")
+            f"in {unit}? Then name the columns {columns} and convert the map by halbach-fe "
+            "import-map or, if all maps of the study are so, the held-out one too, set "
+            f"instrument.flux_density_unit_T = {factor} in it.")
         if is_placeholder(largest):
             raise MeasurementError(must_be(
                 f"reading {row}", where, f"below {MAX_FIELD_T:g} T",

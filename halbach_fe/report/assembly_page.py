@@ -138,7 +138,7 @@ def drawing(
 ) -> Drawing:
     """Return what the template draws for a sheet; serial numbers go without their ``prefix``.
 
-    ``ordered_as`` names for a kind of blocks the kind that it is, turned upside down.
+    ``ordered_as`` names for a kind of blocks the kind that it is, turned over or about.
 
     The labels of the outermost blocks are outside of the plate, those of the innermost, if there
     are others, in its bore, and all others on the blocks.
@@ -274,7 +274,7 @@ def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[Rows]:
         if kinds:
             number = one.kind.number
             other = ordered_as.get(number, number)
-            row["kind"] = str(number) if other == number else f"{other}, upside down"
+            row["kind"] = str(number) if other == number else f"{other}, turned"
         rows.append(row | {"way round": one.way_round.replace("counter-clockwise", "ccw")
                            .replace("clockwise", "cw").replace("from outwards, ", "")})
     tables = min(most_tables, -(-len(rows) // shortest))
@@ -410,7 +410,7 @@ def answer(assembly: Assembly) -> Answer:
     different = len(set(assembly.ordered_as))
     if different < len(assembly.kinds):
         said.append(f"To order are {counted(different, 'kind')}: the others are the same blocks, "
-                    "turned upside down.")
+                    "turned over or about.")
     if not any(kind.material for kind in assembly.kinds):
         said.append("The study names no grade (array.material): order one that has the remanence "
                     "of the table, and bears the temperature and the field of the others, which "
@@ -449,7 +449,7 @@ def _kind_rows(assembly: Assembly) -> Rows:
              **({"grade": kind.material or ""} if graded else {}),
              "blocks": str(kind.count),
              **({"to order": str(total[kind.number]) if first == kind.number else
-                 f"kind {first}, upside down"} if fewer else {})}
+                 f"kind {first}, turned"} if fewer else {})}
             for kind, first in zip(assembly.kinds, ordered_as, strict=True)]
 
 
@@ -531,15 +531,15 @@ def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
 def page(assembly: Assembly, progress: Progress = quiet) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)
-    upside_down = ("" if not kinds or "to order" not in kinds[0] else " Kinds that differ only in "
-                   "the sign of the magnetization along y and z are the same block, turned about x "
-                   "by 180°: upside down.")
+    turned = ("" if not kinds or "to order" not in kinds[0] else " Where the shape looks the same "
+              "upside down, or a cube on another side, kinds whose magnetization turns with it are "
+              "the same block.")
     first, *solids = solid_names(assembly)
     return Page("cad", "assembly", assembly.magnet.study, answer(assembly), _summary(assembly), [
         Section([
             Table(kinds), "Sizes are along the block's own x × y × z: in a ring x points outwards, "
             "or along the magnetization where cubes turn with it, and z along the magnet. The "
-            f"magnetization points to the north pole.{upside_down}"], "Blocks to order"),
+            f"magnetization points to the north pole.{turned}"], "Blocks to order"),
         Section([Table(plates), _of_the_plates(assembly)], "Plates to make", about=plates),
         Section(["Magnets attract one another from decimetres away: `halbach-fe forces` computes "
                  "what each block feels while it is inserted.", partial(_sheets, assembly)])],

@@ -218,18 +218,22 @@ def _probability_within(known: Multipoles, limit: float) -> float:
 
 def answer(
     tables: Sequence[MultipoleTable], limit: float | None, disagreement: str | None = None,
-    study: Study | None = None,
+    study: Study | None = None, axis_beside: str = "",
 ) -> Answer:
     """Say how large the unwanted multipoles of the best known magnet are, and what to do next.
 
     ``study`` tells which blocks are not as designed, see `faults_in_words`, and for what blocks
-    would be moved.
+    would be moved; ``axis_beside`` is that of the magnet.
     """
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
     said += only_of_orders(tables[0][0])
     lacking = [lacks_main(best_known(magnets)[1]) for _, magnets in tables]
+    if axis_beside:
+        return Answer(question, said, "Only as those of the field about the z axis, which lies "
+                      "beside the magnet.", axis_beside,
+                      "halbach-fe multipoles STUDY -o DIR", sound=False)
     if all(lacking):
         return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY",
                           best_known(tables[0][1])[1])
@@ -402,7 +406,7 @@ def page(found: MultipoleTables) -> Page:
             "Unwanted multipoles, normal (left) and skew (right); bars are two standard deviations")
     return Page(
         "multipoles", "multipoles", study,
-        answer(found.tables, found.limit, found.disagreement, study),
+        answer(found.tables, found.limit, found.disagreement, study, found.magnet.axis_beside),
         _summary(study, found.tables, found.limit),
         [*sections, Section([*found.left_out, linearized(study)])], tables, figures=figures,
         shown=tuple(figures),

@@ -41,7 +41,12 @@ from halbach_fe.solver.exact_block_field import external_field, field_of, unit_f
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction
 from halbach_fe.solver.moments.solve import solve_moments
-from halbach_fe.solver.routes import finite_element_part, solve_nominal, vacuum_part
+from halbach_fe.solver.routes import (
+    fields_of_others,
+    finite_element_part,
+    solve_nominal,
+    vacuum_part,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import (
     Gaussian,
@@ -261,13 +266,15 @@ def neighbour_remanences(magnet: Magnet) -> list[tuple[tuple[MagnetBlock, ...], 
             for one in magnet.study.external.neighbours]
 
 
-def neighbour_columns(magnet: Magnet, points: Floats) -> Floats:
+def neighbour_columns(magnet: Magnet, points: Floats, session: Session | None = None) -> Floats:
     """Return B (n, 3, parameters) in T at points (n, 3) in m per A/m of the parameters of
-    `neighbour_prior`.
+    `neighbour_prior`, in vacuum or, by a ``session``, with what iron answers.
     """
     return np.concatenate([np.zeros((*points.shape, 0)), *(
         unit @ matrix for blocks, matrices in neighbour_remanences(magnet)
-        for unit, matrix in zip(unit_fields(blocks, points), matrices, strict=True))], axis=2)
+        for unit, matrix in zip(
+            unit_fields(blocks, points) if session is None else fields_of_others(
+                magnet, blocks, points, session), matrices, strict=True))], axis=2)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:
@@ -392,10 +399,10 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
     off = float(np.linalg.norm(distribution.mean[:len(nominal)] - nominal))
     doubted = 1.2  # times nominal; none magnetized is 1, a third of the blocks upside down 1.15
     if off > doubted * np.linalg.norm(nominal) > 0:
-        warnings.warn(f"In `{name}` the blocks of magnet {magnet.name} are farther from the "
-                      "nominal ones than if none were magnetized, by "
-                      f"{off / np.linalg.norm(nominal):.0%} of these. Is it of another magnet?",
-                      HalbachWarning, stacklevel=2)
+        warnings.warn(f"As they were given or found, the blocks of magnet {magnet.name} are "
+                      "farther from the nominal ones than if none were magnetized, by "
+                      f"{off / np.linalg.norm(nominal):.0%} of these. Are they, or the map, of "
+                      "another magnet?", HalbachWarning, stacklevel=2)
     return magnetized(magnet, with_neighbours(magnet, distribution), name)
 
 

@@ -35,7 +35,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation_operator import flux_density_at
-from halbach_fe.response.block_variation import neighbour_columns, neighbour_remanences
+from halbach_fe.response.block_variation import neighbour_remanences
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
@@ -334,7 +334,7 @@ def field_on_lines(
         error = weak = model.error
         polarization = np.zeros((lines.points[..., 0].size, 3, flux.shape[2]))
         if (others := magnetizations.beside) is not None:
-            flux = flux + neighbour_columns(magnet, points) @ np.column_stack(
+            flux = flux + model.of_neighbours.reshape(*points.shape, -1) @ np.column_stack(
                 [others.mean, np.asarray(others.root)])
     shape = lines.points.shape
     every, bars = (each.reshape(-1, *shape[1:], *each.shape[2:]) for each in (

@@ -28,7 +28,6 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.source_free_field import solid_harmonic_fields
-from halbach_fe.response.block_variation import neighbour_columns
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.region import SHOWN_DEGREES, Region, Sampling, region_points, sphere_points
 from halbach_fe.solver.session import Session
@@ -131,9 +130,6 @@ class HomogeneityModel:
     """Of Bx, By and Bz at each point."""
     degrees: int
     """Largest degree of the harmonics."""
-    of_neighbours: Floats
-    """Of the same for what the magnetizations of neighbours' blocks deviate, which a distribution
-    knows beside its parameters. Shape (3 m, neighbours' parameters), in T m/A."""
 
     @property
     def weights(self) -> Floats:
@@ -186,7 +182,7 @@ class HomogeneityModel:
         own, others = np.split(magnetizations, [len(self.response.nominal)])
         values = self.response.matrix[rows] @ own
         if len(others):
-            values = values + self.of_neighbours[rows] @ others
+            values = values + self.response.of_neighbours[rows] @ others
         return np.asarray(self.response.offset[rows, None] + values).reshape(
             -1, 3, magnetizations.shape[1])
 
@@ -399,8 +395,7 @@ def homogeneity_model(
     every = np.vstack([sampling.points, planes[in_air]])
     observation = observe(bare.study, every, np.ones(every.shape, bool))
     return HomogeneityModel(region, every, sampling, in_air,
-                            response_matrix(bare, observation, session), degrees,
-                            neighbour_columns(magnet, every).reshape(3 * len(every), -1))
+                            response_matrix(bare, observation, session), degrees)
 
 
 def slice_points(region: Region) -> Floats:

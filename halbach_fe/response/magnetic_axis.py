@@ -180,19 +180,19 @@ def _fields(
     """Return B at points (n, 3) in m with the magnetizations ``mean`` in A/m, and with the nominal
     ones, (n, 3) in T, and the derivative (n, 3, parameters) of the former.
     """
-    own, others = session.within("axis"), neighbour_columns(magnet, points)
+    own = session.within("axis")
     if magnet.is_nonlinear:
         uniform = mean[:len(magnet.parameter_names)]
         nominal = solve_nominal(magnet, points, own.within("nominal"))
         field = updated_field(magnet, uniform, points, own.within("updated"))
         columns = Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
-        columns = np.concatenate([columns, others], axis=2)
+        columns = np.concatenate([columns, neighbour_columns(magnet, points)], axis=2)
         # variations inside blocks, and neighbours' blocks
         beside = columns[..., len(uniform):] @ mean[len(uniform):]
         return field + beside, nominal, columns
     response = response_matrix(magnet, flux_density_at(points), own)
-    columns, external = (values.reshape(len(points), 3, *values.shape[1:])
-                         for values in (response.whole, response.offset))
+    columns, external, others = (values.reshape(len(points), 3, *values.shape[1:]) for values in (
+        response.whole, response.offset, response.of_neighbours))
     nominal = columns @ response.nominal + external
     columns = np.concatenate([columns, others], axis=2)
     return columns @ mean + external, nominal, columns

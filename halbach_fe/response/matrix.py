@@ -35,6 +35,7 @@ from halbach_fe.response.block_variation import (
     Variations,
     amplitude_names,
     field_changes,
+    neighbour_columns,
     shared_deviations,
 )
 from halbach_fe.response.discretization_error import discretization_changes, error_bars
@@ -146,6 +147,10 @@ class Response:
     shared_error: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """The changes of all readings together that `error` is made of, with their signs; see
     `halbach_fe.response.discretization_error.discretization_changes`. Shape (k, readings), in T."""
+    of_neighbours: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    """The readings of what the magnetizations of neighbours' blocks deviate, see
+    `halbach_fe.response.block_variation.neighbour_prior`. Shape (readings, parameters of these), in
+    T m/A."""
 
     @property
     def whole(self) -> Floats:
@@ -189,6 +194,8 @@ def response_matrix(
         error = discretization_changes(magnet, observation.points, parts, session)
         built = _assemble(magnet, observation, parts, error, _beside(path, key), changes)
         check_superposition(built.superposition_error, parts.superposition_tolerance)
+    built = replace(built, of_neighbours=observation.apply(np.moveaxis(
+        neighbour_columns(magnet, observation.points, session), 2, 0)).T)
     _write(path, key, built)
     return built
 
@@ -381,7 +388,9 @@ def _write(path: Path, key: str, built: Response) -> None:
          "offset": ("reading", built.offset, {"units": "T"}),
          "error": ("reading", built.error, {"units": "T"}),
          "shared_error": (("change", "reading"), built.shared_error.reshape(
-             -1, len(built.offset)), {"units": "T"})},
+             -1, len(built.offset)), {"units": "T"}),
+         "of_neighbours": (("reading", "neighbours_parameter"), built.of_neighbours.reshape(
+             len(built.offset), -1), {"units": "T m/A"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error,
                "of_similar": int(built.of_similar)})
@@ -421,7 +430,9 @@ def _read(path: Path, key: str) -> Response | None:
                         float(data.attrs["superposition_error"]),
                         of_similar=bool(data.attrs["of_similar"]), reused=True,
                         shared_error=untrusted_files.finite_array(
-                            data["shared_error"], (data.sizes["change"], *readings)))
+                            data["shared_error"], (data.sizes["change"], *readings)),
+                        of_neighbours=untrusted_files.finite_array(data["of_neighbours"], (
+                            *readings, data.sizes["neighbours_parameter"])))
     except FileNotFoundError:
         return None
     except (OSError, EOFError, KeyError, ValueError, TypeError) as error:

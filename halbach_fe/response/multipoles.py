@@ -318,8 +318,9 @@ def multipole_models(
         part = slice(first, first + len(observation))
         first = part.stop
         integrated = magnet.dimension == 3 and z is None
-        matrix = _complexes(model.matrix[part])
-        offset, error = _complexes(model.offset[part]), model.error[part]
+        matrix, offset, others = (_complexes(each[part]) for each in (
+            model.matrix, model.offset, model.of_neighbours))
+        error = model.error[part]
         index = np.array([main, *orders]) - 1
         place = ("The field integrated along z" if integrated
                  else f"The circle at z = {decimals(1e3 * (z or 0.0), 4)} mm")
@@ -327,6 +328,7 @@ def multipole_models(
         try:
             if integrated:
                 matrix, offset, error = _along_all_z(magnet, observation, model, part)
+                others = _neighbours_along_all_z(magnet, observation, model.of_neighbours[part])
             else:
                 _check_no_source(magnet, radius, z or 0.0)
             why = (f"no multipole of order {main}, which cancels there: its table, in units of "
@@ -342,31 +344,31 @@ def multipole_models(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * offset[index], error[index], model.nominal, -turn,
             magnet.external.background_T if integrated else (0.0, 0.0, 0.0),
-            phases[:, None] * _of_neighbours(magnet, observation, radius, integrated)[index]))
+            phases[:, None] * others[index]))
     for each in left_out:
         warnings.warn(each, HalbachWarning, stacklevel=2)
     return models, tuple(left_out)
 
 
-def _of_neighbours(
-    magnet: Magnet, observation: Observation, radius: float, integrated: bool
+def _neighbours_along_all_z(
+    magnet: Magnet, observation: Observation, readings: Floats
 ) -> Complexes:
-    """Return C_n (K, parameters) of the `neighbour_prior` in T m/A, or in T m^2/A if integrated
-    along all of z.
+    """Return C_n (K, parameters) of the `neighbour_prior`, integrated along all of z, in T m^2/A.
+
+    ``readings`` are the sums of `_along_all_z`, which are kept for what iron adds.
     """
-    if not integrated:
-        return _complexes(_of_neighbours_read(magnet, observation))
-    highest = observation.operator.shape[0] // 4  # rows of the field near the magnet, and beyond
-    return np.hstack([np.zeros((highest, 0)), *(
+    added = readings - _neighbours_in_vacuum(magnet, observation)
+    near, far = np.split(added, 2)
+    radius, highest = float(np.hypot(*observation.points[0, :2])), len(near) // 2
+    return _complexes(near + far) + np.hstack([np.zeros((highest, 0)), *(
         np.einsum("bk,bm->kbm", _integrals_of_shapes(blocks, radius, highest)[0],
                   matrices[:, 0] + 1j * matrices[:, 1]).reshape(highest, -1)
         for blocks, matrices in neighbour_remanences(magnet))])
 
 
-def _of_neighbours_read(magnet: Magnet, observation: Observation) -> Floats:
-    """Return readings (n, parameters) in T per A/m of the `neighbour_prior`."""
-    columns = neighbour_columns(magnet, observation.points)
-    return observation.apply(np.moveaxis(columns, -1, 0)).T
+def _neighbours_in_vacuum(magnet: Magnet, observation: Observation) -> Floats:
+    """Return readings (n, parameters) in T per A/m of the `neighbour_prior` without iron."""
+    return observation.apply(np.moveaxis(neighbour_columns(magnet, observation.points), -1, 0)).T
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
@@ -446,7 +448,7 @@ def circle_models(
     def from_middle(z: float) -> float:
         return abs(z - magnet.middle_z_m)
 
-    deviations, neighbours = Deviations.of(magnet), _of_neighbours_read(magnet, observation)
+    deviations = Deviations.of(magnet)
     circles = [(radius, z, analysis) for radius, z, analysis in _read_circles(magnet, observation)
                if not _source_within(magnet, radius, z)]
     for radius in sorted({radius for radius, _, _ in circles}):
@@ -463,7 +465,7 @@ def circle_models(
                 deviations, observation, radius, z, analysis.shape[0] // 2, whole)
             by_z[z] = _complexes(_seen(analysis, model.matrix)) - mistaken
             offsets[z] = _complexes(_seen(analysis, model.offset)) - of_others
-            beside[z] = _complexes(_seen(analysis, neighbours)) - of_neighbours
+            beside[z] = _complexes(_seen(analysis, model.of_neighbours)) - of_neighbours
         reference, fixed, others = (each[min(by_z, key=from_middle)][main - 1:main]
                                     for each in (by_z, offsets, beside))
         try:
@@ -508,7 +510,8 @@ def solved_circles(
     observation = observe(bare.study, points, np.ones_like(points, bool))
     readings = observation.apply(flux_density)
     # a model with a single parameter, the strength of the whole magnet
-    whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
+    whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0,
+                     of_neighbours=_neighbours_in_vacuum(magnet, observation))
     exact = Gaussian(np.ones(1), np.zeros((1, 1)))
     return [(model, model.of(exact)) for model in circle_models(
         bare, observation, whole, whole=True)]

@@ -632,7 +632,9 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     unknowns = known or round(4 / 3 * estimate)
     if available is None or gib_each * unknowns <= available:
         return
-    hint, key = "Leave out thin bodies of iron.", "growth"
+    reach = max(max(body.radius, body.half_length) for body in magnet.iron)
+    hint, key = (f"The iron reaches {reach:.3g} m from the origin; was it meant in another unit? "
+                 "Otherwise leave out thin bodies."), "growth"
     # half the memory is left to others
     enough = available / gib_each / 2 * estimate / unknowns
     tried = [("block_size_m", magnet.study.array.outer_radius_m), ("growth", 4.0)]

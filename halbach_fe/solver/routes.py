@@ -10,7 +10,7 @@ scalar potential), ``scalar_potential`` and ``edge_elements`` (3D, vector potent
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -25,7 +25,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
-from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.iron_modes import reciprocal_gradients, saves_solves
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
@@ -40,6 +40,7 @@ from halbach_fe.solver.magnetostatics import (
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.separate_blocks import (
     applies,
+    columns_of_iron,
     external_acts,
     field_in_vacuum,
     iron_alone,
@@ -381,6 +382,20 @@ def _join_parts(
     return ElementFields(max(fields.superposition_tolerance for _, fields in parts), nominal, along,
                          magnet.blocks, block, error,
                          any(fields.for_deviations for _, fields in parts))
+
+
+def fields_of_others(
+    magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, session: Session
+) -> Iterator[Floats]:
+    """Yield B (n, 3, 3) of single blocks of other magnets at points (n, 3) in m, in T per T of
+    remanence along each axis, with what iron answers where it does to external fields.
+    """
+    vacuum = unit_fields(blocks, points)
+    if session.counter is not None or not blocks or not external_acts(magnet) or (
+            choose_route(magnet, points) is not Route.MOMENTS):
+        return vacuum
+    iron = solve_separate(magnet, session).iron
+    return vacuum if iron is None else map(np.add, vacuum, columns_of_iron(iron, blocks, points))
 
 
 def runs_serve_other_points(magnet: Magnet, points: Floats) -> bool:

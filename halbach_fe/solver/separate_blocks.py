@@ -11,7 +11,7 @@ in the source of the iron on the usual mesh, is of second order in that small nu
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -252,7 +252,7 @@ def separate_columns(
 
     The permeability of the blocks and the iron each answer to the block's own field; what one of
     them answers to the other is neglected, because single blocks describe deviations of a few per
-    cent from the nominal magnet. Iron of any shape answers on the coarser mesh of its error bar.
+    cent from the nominal magnet.
 
     Returns
     -------
@@ -263,17 +263,7 @@ def separate_columns(
     blocks = magnet.blocks
     of_blocks = reaction_columns(
         blocks, points, progress=progress) if _permeable(blocks) else None
-    of_iron: Floats | None = None
-    # angles at which the fields of single blocks on the iron are given, for the 24 modes of
-    # `IronReaction.tangent`
-    tangent_angles = 64
-    if iron is not None:
-        if not magnet.iron_is_axisymmetric:
-            iron = iron.coarse or iron
-        nodes = iron.nodes(tangent_angles)
-        of_iron = np.array([
-            np.moveaxis(iron.tangent(np.moveaxis(unit, 2, 0), points), 0, 2)
-            for unit in unit_fields(blocks, nodes)])
+    of_iron = None if iron is None else np.array(list(columns_of_iron(iron, blocks, points)))
 
     def column(number: int, some: Ints | slice) -> Floats:
         total = np.zeros((len(points[some]), 3, 3))
@@ -284,6 +274,20 @@ def separate_columns(
         return total
 
     return column
+
+
+def columns_of_iron(
+    iron: IronReaction | BodiesReaction, blocks: Sequence[MagnetBlock], points: Floats
+) -> Iterator[Floats]:
+    """Yield the reaction (n, 3, 3) of iron to every single block at points (n, 3) in m, in T per T
+    of remanence along each axis. Iron of any shape answers on the coarser mesh of its error bar.
+    """
+    # angles at which the fields of single blocks on the iron are given, for the 24 modes of
+    # `IronReaction.tangent`
+    tangent_angles = 64
+    acting = (iron.coarse or iron) if isinstance(iron, BodiesReaction) else iron
+    for unit in unit_fields(blocks, acting.nodes(tangent_angles)):
+        yield np.moveaxis(acting.tangent(np.moveaxis(unit, 2, 0), points), 0, 2)
 
 
 def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:

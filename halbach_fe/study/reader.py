@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import (
     MAX_QUOTED,
     HalbachWarning,
@@ -37,7 +38,7 @@ from halbach_fe.study.iron_keys import (
     read_stl,
 )
 from halbach_fe.study.model import Study, iron_of
-from halbach_fe.study.types import reason, sentence
+from halbach_fe.study.types import MAX_LENGTH_M, reason, sentence
 
 
 @typed
@@ -119,7 +120,6 @@ def _doubted_units(study: Study) -> list[str]:
     # from the next one beyond which it is not turned on purpose.
     large_turn_rad, off_step = 0.3, 0.05
     large_block_m = 1.0  # size of no block of a magnet: it would weigh some tons
-    small_iron_m = 1e-3  # size of no body of iron that is worth a file
     found = []
     for instrument in (study.instrument, *(one.instrument for one in study.maps)):
         for turn in instrument.rotation_rad if instrument else ():
@@ -135,12 +135,6 @@ def _doubted_units(study: Study) -> list[str]:
     thick = study.array.outer_radius_m - study.array.inner_radius_m
     if study.array.rings and thick > large_block_m:
         found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")
-    for number, body in enumerate(study.iron.bodies if study.iron else (), start=1):
-        if body.kind == "stl" and body.triangles_m:
-            largest = np.ptp(np.array(body.triangles_m).reshape(-1, 3), axis=0).max()
-            if largest < small_iron_m:
-                found.append(f"`iron.bodies[{number}]` is only {1e3 * largest:.3g} mm large. Were "
-                             "metres or inches meant? Then set its unit_m to 1 or 0.0254.")
     found += _doubted_curves(study)
     found += (f"`array{key}`: {doubt}" for key, one in (
         ("", study.array), *((f".ring[{number}]", ring)
@@ -209,10 +203,25 @@ def _with_triangles(body: IronBody, key: str, folder: Path, where: str) -> IronB
         return body
     with _reading(folder / body.file, f"{key}.file", where, "a closed surface in an STL file"
                   ) as path:
-        triangles = closed_surface(body.unit_m * read_stl(path)).tolist()
+        triangles = closed_surface(body.unit_m * read_stl(path))
+        _check_size(triangles, body.unit_m)
         # the triangles are in m: the unit was that of the file
-        return body.with_(file=None, triangles_m=triangles,
+        return body.with_(file=None, triangles_m=triangles.tolist(),
                           unit_m=type(body).model_fields["unit_m"].default)
+
+
+def _check_size(triangles: Floats, unit_m: float) -> None:
+    """Raise a ValueError if a body, of triangles (n, 3, 3) in m, can only be in another unit."""
+    smallest_m = 1e-3  # size of no body of iron that is worth a file
+    largest = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    if smallest_m <= largest < MAX_LENGTH_M:
+        return
+    others = [f"unit_m = {unit:g} ({name}) for {largest / unit_m * unit:.3g} m"
+              for name, unit in (("mm", 1e-3), ("inches", 0.0254), ("metres", 1.0))
+              if smallest_m <= largest / unit_m * unit < MAX_LENGTH_M]
+    raise ValueError(f"by unit_m = {unit_m:g} the body is {largest:.3g} m large, where "
+                     f"{smallest_m:g} to {MAX_LENGTH_M:g} m are expected. Write "
+                     f"{' or '.join(others) or 'the unit of the file in m'}")
 
 
 @contextmanager

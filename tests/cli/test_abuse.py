@@ -13,6 +13,7 @@ import warnings
 from dataclasses import replace
 
 import gmsh
+import numpy as np
 import pytest
 import tomlkit
 
@@ -626,3 +627,41 @@ def test_no_space_for_a_solid(campaign, tmp_path, capsys, monkeypatch, kept):
     assert code == 8
     assert f"File too large; {kept} bytes could be written" in sentence
     assert not (tmp_path / "out" / "blocks.step").exists()
+
+
+def test_advice_for_a_held_out_map_in_mt_works(campaign, tmp_path, capsys):
+    """Beside a map in T. The key of the study, which was advised, has both in its unit."""
+    study, measured, _ = campaign
+    magnet = build_magnet(read_study(study))
+    points = points_from(magnet.study.observation.positions) + np.array([0.0, 0.0, 1e-4])
+    held = tmp_path / "held.csv"
+    write_map(field_map(points, 1e3 * field_of(magnet.blocks, points)), held)
+
+    def check(one, code):
+        capsys.readouterr()
+        assert main([*map(str, ["infer", study, "--measurements", measured, "--held-out", one,
+                                "-o", tmp_path / "out", "--dry-run"])]) == code
+        return capsys.readouterr().err
+
+    said = check(held, 4)
+    assert "Then name the columns Bx_mT, By_mT, Bz_mT or" in said
+    assert "if all maps of the study are so, the held-out one too" in said
+    header, *rows = held.read_text().splitlines(keepends=True)
+    for unit in ("x", "y", "z"):
+        header = header.replace(f"B{unit}_T", f"B{unit}_mT")
+    held.write_text(header + "".join(rows))
+    assert main(["import-map", str(held), "-o", str(tmp_path / "converted.csv")]) == 0
+    check(tmp_path / "converted.csv", 0)
+
+
+def test_blocks_far_from_the_nominal_ones_are_told_in_words_of_a_user(campaign, tmp_path, capsys):
+    """The sentence named the argument `magnetizations` of a function in Python."""
+    study, _, _ = campaign
+    magnet = build_magnet(read_study(study))
+    points = points_from(magnet.study.observation.positions)
+    write_map(field_map(points, -field_of(magnet.blocks, points)), tmp_path / "reversed.csv")
+    assert main([*map(str, ["infer", study, "--measurements", tmp_path / "reversed.csv", "-o",
+                            tmp_path / "out"])]) == 0
+    said = capsys.readouterr().err
+    assert "farther from the nominal ones than if none were magnetized" in said
+    assert "`magnetizations`" not in said

@@ -136,11 +136,29 @@ def test_the_plan_says_which_block_goes_where(made):
         f"outer diameter of {2e3 * OUTER:.5g} mm and a bore of {2e3 * INNER:.5g} mm")))
 
 
+def test_blocks_of_one_part_are_ordered_together():
+    """Cubes of one grade magnetized along x, -x, y or z, and bars of which one lies along x and is
+    magnetized so; another one, along z and magnetized along x, is another part. It was six kinds.
+    A cylinder may be turned about its axis by any angle.
+    """
+    columns = {"shape": ["cuboid"] * 7 + ["cylinder"] * 2, "x_m": 0.05 * np.arange(9),
+               "y_m": np.zeros(9), "z_m": np.zeros(9), "radius_m": [None] * 7 + [0.005] * 2,
+               "remanence_x_T": [1.3, -1.3, 0, 0, 1.3, 0, 1.3, 1.3, 0.78],
+               "remanence_y_T": [0, 0, 1.3, 0, 0, 0, 0, 0, 1.04],
+               "remanence_z_T": [0, 0, 0, 1.3, 0, 1.3, 0, 0, 0]}
+    for axis, sides in zip("xyz", ([0.01] * 4 + [0.02, 0.01, 0.01], [0.01] * 7,
+                                   [0.01] * 4 + [0.01, 0.02, 0.02]), strict=True):
+        columns[f"size_{axis}_m"] = [*sides, *([0.01] * 2 if axis == "z" else [None] * 2)]
+    plan = cad(hf.magnet_of_blocks(columns), None)
+    assert [plan.ordered_as[one.kind.number - 1] for one in plan.blocks] == [
+        1, 1, 1, 1, 5, 5, 7, 8, 8]
+
+
 def test_blocks_that_are_the_same_upside_down_are_ordered_together():
-    """Cuboids magnetized at the same angle from the radius, on either side of it."""
+    """Bars of square ends magnetized at the same angle from any of their long sides."""
     array = DOCUMENT["array"] | {"block": {"shape": "cuboid", "width_m": SIDE}}
     plan = cad(build_magnet(parse_study(DOCUMENT | {"array": array})), None)
-    angle = {kind.number: round(abs(np.degrees(np.arctan2(*kind.direction[1::-1]))))
+    angle = {kind.number: round(np.degrees(np.arctan2(*kind.direction[1::-1]))) % 90
              for kind in plan.kinds}
     assert len(set(plan.ordered_as)) == len(set(angle.values())) < len(plan.kinds)
     for kind, first in zip(plan.kinds, plan.ordered_as, strict=True):
@@ -195,9 +213,9 @@ def test_the_sheet_names_the_kind_that_was_ordered():
     rows = [row for rows in drawing(sheet, "", turned).tables for row in rows]
     assert {row["kind"] for row in rows} == {
         str(one.kind.number) if turned[one.kind.number] == one.kind.number
-        else f"{turned[one.kind.number]}, upside down" for one in sheet.blocks}
-    assert any("upside down" in row["kind"] for row in rows)
-    assert not any("upside down" in row["kind"]  # the control
+        else f"{turned[one.kind.number]}, turned" for one in sheet.blocks}
+    assert any("turned" in row["kind"] for row in rows)
+    assert not any("turned" in row["kind"]  # the control
                    for rows in drawing(sheet, "").tables for row in rows)
 
 

@@ -307,7 +307,7 @@ def test_effects_of_no_size_change_nothing(name):
     assert shown(applied) == pytest.approx(shown(study), abs=1e-15)
 
 
-@pytest.mark.filterwarnings("ignore:Blocks of .* lie around an axis")
+@pytest.mark.filterwarnings("ignore:.*about the z axis. The blocks lie")
 def test_what_is_outside_the_magnet_lies_about_its_own_middle():
     """Blocks of a table need not lie about z = 0, nor about the z axis."""
     names = ("neighbour_magnet", "ferromagnetic_object", "iron_ring")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 
 import magpylib
 import numpy as np
@@ -15,6 +16,7 @@ import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.page import page_of
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed
@@ -218,7 +220,25 @@ def test_blocks_around_another_axis_than_z_are_doubted(x, y):
     columns |= {"x_m": [x + each for each in columns["x_m"]],
                 "y_m": [y + each for each in columns["y_m"]]}
     beside = np.hypot(x, y) > 0.07
-    with pytest.warns(HalbachWarning, match=r"add -0.3 to x_m and 0.1 to y_m") if beside else (
+    with pytest.warns(HalbachWarning, match=r"add -0\.3 to x_m and 0\.1 to y_m") if beside else (
             contextlib.nullcontext()):
         magnet = hf.magnet_of_blocks(columns)
     assert magnet.middle_m == pytest.approx((x, y, 0.0) if beside else (0.0, 0.0, 0.0))
+
+
+def test_multipoles_beside_the_magnet_are_not_answered():
+    """They were about the empty z axis, with the advice to look at other z, as of an undulator.
+    What is advised now gives those of the ring about the z axis, which is the control.
+    """
+    ring = hf.halbach_ring(blocks=8, inner_radius_m=0.05, outer_radius_m=0.07, length_m=0.03)
+    columns = blocks_table(ring)
+    with pytest.warns(HalbachWarning, match="about the z axis"):
+        beside = hf.magnet_of_blocks(columns | {"x_m": [0.3 + each for each in columns["x_m"]]})
+    found = page_of(hf.multipoles(beside)).answer
+    assert found.trust.startswith("Only as those of the field about the z axis")
+    (move,) = re.findall(r"add (\S+) to x_m of the table", found.step)
+    moved = hf.magnet_of_blocks(columns | {"x_m": [
+        0.3 + each + float(move) for each in columns["x_m"]]})
+    for one, other in zip(hf.multipoles(moved).tables, hf.multipoles(ring).tables, strict=True):
+        assert one[1]["prior"].main == pytest.approx(other[1]["prior"].main, rel=1e-6)
+    assert not page_of(hf.multipoles(moved)).answer.trust.startswith("Only")

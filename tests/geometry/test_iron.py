@@ -407,9 +407,12 @@ def test_stl_files(tmp_path, change, sentence):
         (body,) = build_magnet(read_study(study)).iron
         assert body.measures[0] == pytest.approx(0.1 * 0.2 * 0.04)
         text = study.read_text()
-        study.write_text(text.replace('"body.stl"', '"body.stl"\nunit_m = 1e-6'))
-        with pytest.warns(HalbachWarning, match=r"only 0\.2 mm large\. Were metres or inches"):
-            read_study(study)
+        for unit, said in (("1e-6", r"is 0\.0002 m large.*unit_m = 0\.001 \(mm\) for 0\.2 m or "
+                            r"unit_m = 0\.0254 \(inches\) for 5\.08 m\."),
+                           ("1.0", r"is 200 m large.*unit_m = 0\.001 \(mm\) for 0\.2 m or")):
+            study.write_text(text.replace('"body.stl"', f'"body.stl"\nunit_m = {unit}'))
+            with pytest.raises(StudyError, match=said):
+                read_study(study)
         return
     with pytest.raises(StudyError, match=sentence):
         read_study(study)

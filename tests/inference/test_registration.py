@@ -56,7 +56,7 @@ from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
 
 
-@pytest.mark.filterwarnings("ignore:Blocks of .* lie around an axis")
+@pytest.mark.filterwarnings("ignore:.*about the z axis. The blocks lie")
 def test_a_magnet_beside_the_z_axis_is_found(magnet, generator, tmp_path):
     """The search went along the z axis, where such a magnet has a weak field, and its answer was
     that the map is of another magnet. Its middle on the stage was that of the study's origin.

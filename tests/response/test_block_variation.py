@@ -15,9 +15,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response.block_variation import Variations, neighbour_columns, neighbour_prior
+from halbach_fe.response.field_on_lines import field_on_lines
 from halbach_fe.response.homogeneity import DRAWS
+from halbach_fe.response.multipoles import multipole_models
 from halbach_fe.solver.exact_block_field import external_field
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
 from tests.support import short_dipole
 
@@ -221,3 +225,40 @@ def test_bars_before_a_map_have_the_blocks_of_neighbours(turn_deg):
     assert np.sqrt(along @ alone**2) < (1 - share) * found.mean_sd_T
     drawn = hf.tolerance(magnet, session, draws=DRAWS, reference=reference).main
     assert drawn.std() == pytest.approx(tables[1][1]["prior"].main_sd, rel=share)
+
+
+def test_iron_answers_to_what_blocks_of_neighbours_deviate():
+    """Beside a box of iron bars and readings are changes of the nominal field by a neighbour that
+    is 1 % stronger; those of vacuum, which they were, are the control, up to twice as long.
+    """
+    def beside(strength):
+        return hf.halbach_ring(
+            blocks=4, inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.03, remanence_T=1.2,
+        ).with_(mesh__block_size_m=0.012, external={
+            "neighbours": [{"z_m": 0.12, "factor": strength}]}, iron={
+                "relative_permeability": 1000.0, "bodies": [{
+                    "kind": "box", "size_m": [0.08, 0.02, 0.06], "centre_m": [0.0, 0.08, 0.10]}]})
+
+    share, magnet, session = 0.01, beside(1.0), Session.temporary()
+    nominal = magnet.nominal_magnetization
+    known = Gaussian(nominal, 0 * nominal[:, None]).with_beside(
+        Gaussian(0 * nominal, share * nominal[:, None]))
+    line = hf.Lines((0, 0.03, 0.06), (0, 0.055, 0.06), count=6)
+    points = line.points.reshape(-1, 3)
+    weak, strong = (solve_nominal(beside(factor), points, session.within(str(factor)))
+                    for factor in (1.0, 1.0 + share))
+    found = field_on_lines(magnet, line, known, session).root[0, ..., -1]
+    alone = share * external_field(magnet, points)
+    change = strong - weak
+    # blocks answer on a mesh of twice the size of elements: 1 % of what iron adds
+    np.testing.assert_allclose(found, change, atol=0.02 * np.abs(change - alone).max())
+    assert np.abs(alone - change).max() > 0.3 * np.abs(change).max()
+    again = neighbour_columns(magnet, points) @ nominal * share
+    np.testing.assert_allclose(again, alone, atol=1e-9)
+    references = [hf.MultipoleReference(0.01, (2, 3), z_m) for z_m in (0.05, None)]
+    (weak, _), (strong, _) = (multipole_models(beside(factor), references, session.within(
+        f"multipoles {factor}")) for factor in (1.0, 1.0 + share))
+    for one, more in zip(weak, strong, strict=True):  # near the end of the magnet, and integrated
+        change = more.offset + more.matrix @ nominal - one.offset - one.matrix @ nominal
+        found = share * one.of_neighbours @ nominal
+        np.testing.assert_allclose(found, change, atol=0.01 * np.abs(change).max())

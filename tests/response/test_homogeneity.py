@@ -428,7 +428,7 @@ def test_harmonics_are_the_derivatives_at_the_centre(generator, tmp_path):
     assert max(each.sd_ppm for each in apart.harmonics) > 1e-4 * largest
 
 
-@pytest.mark.filterwarnings("ignore:Blocks of .* lie around an axis")
+@pytest.mark.filterwarnings("ignore:.*about the z axis. The blocks lie")
 def test_the_region_of_a_magnet_away_from_the_origin(tmp_path):
     """It was about the origin, 0.3 m away, in the fringe field of free blocks. Control: there."""
     ring = ring_of_cubes()

@@ -660,7 +660,8 @@ def test_circles_beside_poles_of_iron_have_enough_angles(monkeypatch):
         place = (observation.points[:, 0] + 1j * observation.points[:, 1]) / 0.015
         field = sum(place**(order - 1) for order in (2, *range(40, 301)))
         readings = observation.apply(np.column_stack([field.imag, field.real, 0 * field.real]))
-        return Response(readings[:, None], ("strength",), np.ones(1), *2 * (0 * readings,), 0.0)
+        return Response(readings[:, None], ("strength",), np.ones(1), *2 * (0 * readings,), 0.0,
+                        of_neighbours=np.zeros((len(readings), 0)))
 
     monkeypatch.setattr(multipoles, "response_matrix", response)
     magnet = build_magnet(parse_study(POLES))
