@@ -29,8 +29,8 @@ from halbach_fe.solver.iron_bodies import BAR, BodiesReaction
 from halbach_fe.solver.separate_blocks import SeparateReaction, separate_columns, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 Truth = Callable[[Magnet, Floats], Floats]
 """What the iron and the blocks' permeability add (n, 3) in T at points (n, 3) in m."""

@@ -29,8 +29,8 @@ from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import draw_magnet, true_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import changed
 from tests.design.test_shim_tray import DOCUMENT, NOISE_T, STRENGTH_SD, cuboid, shims
 

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model

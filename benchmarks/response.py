@@ -14,7 +14,7 @@ from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, refined, verify
 from halbach_fe.response.matrix import Response, response_matrix

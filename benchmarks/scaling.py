@@ -30,7 +30,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.resource_estimate import estimate_infer
 from halbach_fe.solver.azimuthal_modes import solve_modes

@@ -305,7 +305,7 @@ def solve(study: Path) -> dict[str, float]:
 def response(study: Path) -> dict[str, float]:
     """Build the response matrix of a study, error bars included."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.measurement.observation import observe
+    from halbach_fe.measurement.observation_operator import observe
     from halbach_fe.measurement.positions import points_from
     from halbach_fe.response.matrix import response_matrix
     from halbach_fe.solver.getdp import find_getdp

@@ -27,20 +27,20 @@ from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
-from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Effect
-from halbach_fe.diagnosis.linearization import Linearization, NominalSolver
-from halbach_fe.diagnosis.model_selection import (
+from halbach_fe.diagnosis.effect_comparison import Search, identify_effects, score_hypotheses
+from halbach_fe.diagnosis.effect_selection import (
     EFFECT_PRIOR_ODDS,
     WIDE_PRIOR_SD,
     log_bayes_factors,
     prior_log_odds,
     with_candidates,
 )
-from halbach_fe.diagnosis.naming import SUSPECTED, Further, families_of, judge, suspicions
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.diagnosis.linearization import Linearization, NominalSolver
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
-from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import Search, identify_effects, score_hypotheses
+from halbach_fe.diagnosis.scanned_maps import Campaign
+from halbach_fe.diagnosis.verdict import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult

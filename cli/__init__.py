@@ -1,4 +1,4 @@
-"""The command line: verbs that are declared with their options, see `halbach_fe.cli.options`.
+"""The command line: verbs that are declared with their options, see `cli/shared_options.py`.
 
 Nothing is imported at the top: Ctrl-C during the imports, which take a second, ends in `main`.
 """

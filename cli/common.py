@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import halbach_fe as hf
 from halbach_fe.cli.guard import claim_buffers, guarded, show
 from halbach_fe.cli.guard import say as say
-from halbach_fe.cli.options import (
+from halbach_fe.cli.shared_options import (
     SOLVER,
     Options,
     Run,
@@ -45,13 +45,13 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import decimals
-from halbach_fe.core.pace import Pace, quiet
-from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.core.progress import Pace, quiet
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from halbach_fe.inference.storage import StoredPosterior
+    from halbach_fe.inference.posterior_files import StoredPosterior
     from halbach_fe.report.answer import Answer
     from halbach_fe.report.page import Page
     from halbach_fe.response.resource_estimate import Estimate
@@ -276,7 +276,7 @@ def blocks_of(path: Path | None) -> hf.BlockTable | None:
 
 def posterior_of(arguments: argparse.Namespace, magnet: hf.Magnet) -> StoredPosterior | None:
     """Read the posterior of the magnet, if it is given."""
-    from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.inference.posterior_files import read_posterior
 
     return read_posterior(magnet, arguments.posterior) if arguments.posterior else None
 
@@ -291,7 +291,7 @@ def read_measurements(
     StudyError
         If both or neither are given, or options describe the format of maps that are listed.
     """
-    from halbach_fe.measurement.campaign import different_maps
+    from halbach_fe.measurement.campaign_maps import different_maps
 
     if bool(study.maps) == (arguments.measurements is not None):
         raise StudyError(must_be(
@@ -312,7 +312,7 @@ def read_one(
     arguments: argparse.Namespace, path: Path, study: hf.Study | None = None
 ) -> xr.Dataset:
     """Read a map, of a magnet's study if there is one, and refuse units that both state."""
-    from halbach_fe.measurement.formats.files import refuse_units_twice
+    from halbach_fe.measurement.formats.import_export import refuse_units_twice
 
     data = _read_one(arguments, path)
     if study is not None:
@@ -325,7 +325,7 @@ def _read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     the file itself says.
     """
     from halbach_fe.measurement.field_map import FOREIGN
-    from halbach_fe.measurement.formats.files import import_map
+    from halbach_fe.measurement.formats.import_export import import_map
 
     if describes_a_format(arguments):
         imported = import_map(path, declared(arguments, DeclaredFormat), arguments.format)

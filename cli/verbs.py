@@ -1,8 +1,9 @@
 """All verbs of the command line, how one is run, and those about the installation: its cache, its
 programs, the keys of studies.
 
-Verbs on maps and tables of measurements are in `halbach_fe.cli.measured`, those that ask of a study
-in `halbach_fe.cli.questions`, those that convert files in `halbach_fe.cli.files`.
+Verbs on maps and tables of measurements are in `halbach_fe.cli.measurement_verbs`, those that
+compute or design a magnet in `halbach_fe.cli.magnet_verbs`, those that convert files in
+`halbach_fe.cli.file_verbs`.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from typing import TYPE_CHECKING
 import shtab
 
 import halbach_fe as hf
-from halbach_fe.cli import common, files, measured, questions
+from halbach_fe.cli import common, file_verbs, magnet_verbs, measurement_verbs
 from halbach_fe.cli.guard import show
-from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, choice, option, path, verb
-from halbach_fe.cli.options import VERBS as VERBS
-from halbach_fe.cli.options import parser as parser
+from halbach_fe.cli.shared_options import CACHE_HELP, GETDP, JSON, choice, option, path, verb
+from halbach_fe.cli.shared_options import VERBS as VERBS
+from halbach_fe.cli.shared_options import parser as parser
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
 from halbach_fe.core.installation import version
 
 if TYPE_CHECKING:
     from halbach_fe.solver.getdp import GetDP
 
-DECLARING = (questions, measured, files)
+DECLARING = (magnet_verbs, measurement_verbs, file_verbs)
 """Modules that declare the other verbs."""
 
 LISTS = ("--columns", "--origin-m", "--axes")

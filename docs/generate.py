@@ -10,15 +10,15 @@ from halbach_fe.cli.verbs import VERBS, parser
 from halbach_fe.study.model import Study
 
 MODULES = (
-    "study.reader", "study.model", "study.array", "study.free_blocks", "study.iron",
-    "study.external", "study.materials", "study.measurement", "study.inference", "geometry.magnet",
-    "stats.gaussian",
-    "stats.posteriors", "solver.exact_block_field", "solver.ring_harmonics_2d",
-    "measurement.field_map", "measurement.block_table", "measurement.campaign",
-    "measurement.observation",
+    "study.reader", "study.model", "study.array_keys", "study.free_blocks", "study.iron_keys",
+    "study.external_keys", "study.materials", "study.measurement_keys", "study.inference_keys",
+    "geometry.magnet", "stats.gaussian", "stats.posteriors",
+    "solver.exact_block_field", "solver.ring_harmonics_2d",
+    "measurement.field_map", "measurement.block_table", "measurement.campaign_maps",
+    "measurement.observation_operator",
     "response.matrix", "inference.infer", "inference.result",
     "diagnosis.diagnose", "diagnosis.result", "diagnosis.marginal_evidence",
-    "diagnosis.model_selection", "diagnosis.effects.base")
+    "diagnosis.effect_selection", "diagnosis.effects.base")
 """Modules documented after the API, in the order of the rooms."""
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.storage import read_posterior
+from halbach_fe.inference.posterior_files import read_posterior
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
 from halbach_fe.study.reader import read_study
 

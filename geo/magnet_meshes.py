@@ -1,4 +1,4 @@
-"""Meshes of a magnet: its cross-section, that stacked in layers along z, and its half-plane (r, z).
+"""Meshes of a magnet with its iron: cross-section, layers of it along z, or half-plane (r, z).
 
 **Equal rings.** The cross-section has blocks of any shape, prisms and tubes of iron, and air up to
 the boundary. All blocks are prisms along z, so that the same plane mesh serves every ring; the
@@ -26,7 +26,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geo.session import gmsh_session, write_mesh
+from halbach_fe.geo.gmsh_session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius

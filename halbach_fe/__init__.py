@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from halbach_fe.magnets import write_study as write_study
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
     from halbach_fe.measurement.block_table import read_blocks as read_blocks
-    from halbach_fe.measurement.campaign import read_maps as read_maps
+    from halbach_fe.measurement.campaign_maps import read_maps as read_maps
     from halbach_fe.measurement.field_map import field_map as field_map
     from halbach_fe.measurement.field_map import read_map as read_map
     from halbach_fe.measurement.field_map import write_map as write_map
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.map_check import check_map as check_map
     from halbach_fe.measurement.map_join import JoinedMaps as JoinedMaps
     from halbach_fe.measurement.map_join import join_maps as join_maps
-    from halbach_fe.report.campaign_report import campaign_report as campaign_report
+    from halbach_fe.report.joint_report import campaign_report as campaign_report
     from halbach_fe.report.page import write_report as write_report
     from halbach_fe.response.discretization_error import Verification as Verification
     from halbach_fe.response.discretization_error import verify as verify
@@ -107,7 +107,7 @@ _HOME = {
     "register": "inference.registration", "Registration": "inference.pose_result",
     "prior_from_blocks": "inference.block_prior", "MeasuredPrior": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
-    "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
+    "read_map": "measurement.field_map", "read_maps": "measurement.campaign_maps",
     "read_blocks": "measurement.block_table",
     "check_map": "measurement.map_check", "join_maps": "measurement.map_join",
     "JoinedMaps": "measurement.map_join", "Session": "solver.session",
@@ -122,7 +122,7 @@ _HOME = {
     "design_rings": "design.ring_design", "Designed": "design.ring_design",
     "cad": "design.assembly", "Assembly": "design.assembly",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
-    "write_report": "report.page", "campaign_report": "report.campaign_report",
+    "write_report": "report.page", "campaign_report": "report.joint_report",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "MapCheck": "measurement.map_check", "Solution": "response.solution",
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",

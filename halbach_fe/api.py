@@ -21,7 +21,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError,
 from halbach_fe.core.files import as_path
 from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
-from halbach_fe.core.pace import Progress, Say, quiet
+from halbach_fe.core.progress import Progress, Say, quiet
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
@@ -44,16 +44,16 @@ from halbach_fe.geometry.array_layout import beside_blocks, blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import MAP, map_homogeneity, of_other_size
+from halbach_fe.inference.posterior_files import disagreement_of, distributions_of
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.storage import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import taking_arrays
-from halbach_fe.measurement.formats.blocks import DeclaredBlocks
-from halbach_fe.measurement.formats.blocks import import_blocks as read_foreign_blocks
-from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
-from halbach_fe.measurement.formats.files import WRITERS, export_map
-from halbach_fe.measurement.formats.files import import_map as read_foreign_map
-from halbach_fe.measurement.instrument import check_total_field
+from halbach_fe.measurement.formats.block_tables import DeclaredBlocks
+from halbach_fe.measurement.formats.block_tables import import_blocks as read_foreign_blocks
+from halbach_fe.measurement.formats.declared_format import FORMATS, DeclaredFormat
+from halbach_fe.measurement.formats.import_export import WRITERS, export_map
+from halbach_fe.measurement.formats.import_export import import_map as read_foreign_map
+from halbach_fe.measurement.probe_law import check_total_field
 from halbach_fe.response.block_variation import nominal_parameters, study_prior
 from halbach_fe.response.field_on_lines import FieldOnLines, Lines, field_on_lines
 from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel, homogeneity_model

@@ -14,8 +14,8 @@ import xarray as xr
 
 from halbach_fe.api import diagnose
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.core.pace import Say, quiet
-from halbach_fe.diagnosis.map_errors import blocks_of
+from halbach_fe.core.progress import Say, quiet
+from halbach_fe.diagnosis.gross_error_correction import blocks_of
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
@@ -26,10 +26,10 @@ from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import is_total_field, taking_arrays
 from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
 from halbach_fe.measurement.suspect_rows import check_total
-from halbach_fe.report import diagnosis_answer, inference_answer, registration
+from halbach_fe.report import diagnosis_answer, inference_answer, registration_page
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.map_check import answer as answer_of_check
-from halbach_fe.report.map_check import are_in_order, corrected
+from halbach_fe.report.map_check_page import answer as answer_of_check
+from halbach_fe.report.map_check_page import are_in_order, corrected
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 
 
@@ -194,8 +194,8 @@ class _InMemory:
             self.say(f"The map cannot be registered: {error}")
             return False
         best = self.poses[0]
-        answer = registration.answer(self.poses, assumed=self.magnet.study.instrument)
-        if registration.STUDY_FILE in answer.command:
+        answer = registration_page.answer(self.poses, assumed=self.magnet.study.instrument)
+        if registration_page.STUDY_FILE in answer.command:
             self.magnet = build_magnet(best.study)
         return self._answered("registered", answer)
 

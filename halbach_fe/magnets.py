@@ -40,7 +40,7 @@ from halbach_fe.study.free_blocks import (
     write_free_blocks,
 )
 from halbach_fe.study.model import Study
-from halbach_fe.study.study_file import (
+from halbach_fe.study.writer import (
     OUTER_RADIUS,
     MagnetTemplate,
     new_study,

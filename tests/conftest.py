@@ -80,17 +80,17 @@ LONGEST = [
 
 QUICK = {
     "cli": "completion dry_run explain export formats new",
-    "core": "hdf5 installation pace result_folder threads",
+    "core": "hdf5 installation progress result_folder threads",
     "design": "cad tolerance",
     "diagnosis": "discriminating_measurements marginal_evidence smooth_discrepancy",
     "docs": "describe_your_magnet figures",
     "geometry": (
         "block_export blocks convex_pieces equal_blocks free_blocks iron neighbours "
         "surface"),
-    "inference": "held_out_map repeated_readings storage",
+    "inference": "held_out_map posterior_files repeated_readings",
     "measurement": (
-        "block_table calibration export_map field_map import_map instrument observation "
-        "one_reader total_field"),
+        "block_table calibration export_map field_map import_map observation_operator one_reader "
+        "probe_law total_field"),
     "report": "figures geometry inference_answer no_bore point_maps study_pages",
     "response": "block_variation deviation_field",
     "solver/moments": "cells irreversible tree",

@@ -22,8 +22,8 @@ from halbach_fe.geometry.outline import Prism, at_heights, upright
 from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.study.array import block_name
-from halbach_fe.study.design import Holder
+from halbach_fe.study.array_keys import block_name
+from halbach_fe.study.design_keys import Holder
 from halbach_fe.study.free_blocks import SIZES
 
 TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")

@@ -22,7 +22,7 @@ from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.interface import ShownInNotebook
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
@@ -38,7 +38,7 @@ from halbach_fe.solver.magnetostatics import (
 )
 from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
-from halbach_fe.study.array import BlockException
+from halbach_fe.study.array_keys import BlockException
 from halbach_fe.study.materials import MU_0, Demagnetization, grade_of
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import ABSOLUTE_ZERO_C

@@ -25,7 +25,7 @@ from halbach_fe.geometry.outline import (
     widened,
     with_notch,
 )
-from halbach_fe.study.design import Holder, Rods
+from halbach_fe.study.design_keys import Holder, Rods
 
 SEGMENTS = {"0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd",
             "6": "afgedc", "7": "abc", "8": "abcdefg", "9": "abcdfg"}

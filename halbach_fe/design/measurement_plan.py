@@ -33,13 +33,13 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.campaign_readings import Readings, read_campaign
 from halbach_fe.inference.infer import neighbour_readings, seen_columns
-from halbach_fe.inference.instrument_fit import open_columns
-from halbach_fe.inference.readings import Readings, read_campaign
-from halbach_fe.measurement.campaign import ONLY_MAP, Map
+from halbach_fe.inference.relinearization import open_columns
+from halbach_fe.measurement.campaign_maps import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import seen, sensor_matrix, sensor_positions
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.probe_law import seen, sensor_matrix, sensor_positions
 from halbach_fe.response.block_variation import neighbour_prior, study_prior, with_variations
 from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.matrix import response_matrix
@@ -48,8 +48,8 @@ from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.posteriors import posterior
-from halbach_fe.study.inference import Inference, InstrumentSd
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import Inference, InstrumentSd
+from halbach_fe.study.measurement_keys import Instrument
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,13 @@ from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.overlaps import overlapping_blocks
 from halbach_fe.response.region import Region
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.array import Array, Ring
-from halbach_fe.study.design import Design, DesignLayer
-from halbach_fe.study.external import External
+from halbach_fe.study.array_keys import Array, Ring
+from halbach_fe.study.design_keys import Design, DesignLayer
+from halbach_fe.study.external_keys import External
 from halbach_fe.study.model import Study
 
 DECIMALS = 9
@@ -217,6 +218,12 @@ def designed(study: Study, rings: Sequence[Ring]) -> Study:
         most = max(ring.blocks_per_ring or array.blocks_per_ring for ring in rings)
         types = {label: tuple(range(1, most + 1)) for label in types}
     return study.with_(array=array.with_(ring=tuple(rings), rings=len(rings)), prior__types=types)
+
+
+def about_origin(study: Study) -> Magnet:
+    """Return the magnet of a study with its rings stacked about z = 0, as those of a design are."""
+    return build_magnet(study.with_(array__ring=[
+        ring.with_(z_m=None) for ring in study.array.ring]))
 
 
 def ring_of(study: Study, ring: RingOfBlocks) -> tuple[MagnetBlock, ...]:

@@ -46,6 +46,7 @@ from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
     RingOfBlocks,
+    about_origin,
     design_of,
     designed,
     fields_with_images,
@@ -468,7 +469,7 @@ def design_rings(
     """
     check_number("seed", "design_rings", seed, 0, whole=True)
     design_of(study)  # refuses other magnets, whose array has no rings
-    region = region or default_region(build_magnet(study))
+    region = region or default_region(about_origin(study))
     catalogue = Catalogue.of(study, region, _density(study))
     design, generator = catalogue.design, np.random.default_rng(seed)
     direction = catalogue.sample.direction

@@ -28,15 +28,15 @@ from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
+from halbach_fe.inference.posterior_files import distributions_of
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.storage import distributions_of
 from halbach_fe.response.block_variation import distribution_of, with_variations
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, homogeneity_model
 from halbach_fe.response.region import Region, default_centre, default_region
 from halbach_fe.solver.exact_block_field import unit_field
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.design import ShimMagnet, ShimTray
+from halbach_fe.study.design_keys import ShimMagnet, ShimTray
 from halbach_fe.study.free_blocks import COLUMNS
 from halbach_fe.study.materials import grade
 from halbach_fe.study.model import Study
@@ -283,7 +283,7 @@ class _Choices:
     def largest(self) -> list[MagnetBlock]:
         """A block in every place that is as large as the largest magnet in each direction."""
         sizes = np.array([each.size_m for each in self.tray.magnets]).max(axis=0).tolist()
-        largest = self.tray.magnets[0].with_(size_m=tuple(sizes))
+        largest = self.tray.magnets[0].with_(size_m=tuple(sizes), angles_deg=(0.0, 180.0))
         return self._in_all_places(largest)
 
     def _in_all_places(self, magnet: ShimMagnet) -> list[MagnetBlock]:

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.interface import ShownInNotebook
-from halbach_fe.core.pace import Progress, quiet
+from halbach_fe.core.progress import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of
 from halbach_fe.geometry.magnet import Magnet

@@ -11,9 +11,9 @@ Gauss-Newton method in which the finite-element model takes the place of the lin
 iteration has converged when a round changes neither the selection nor the amplitudes.
 
 In every round the selected effects compete with causes of any shape, so that effects which only
-add up to something outside the catalogue are not named (`halbach_fe.diagnosis.competition`). In the
-first round, in which the signatures of large effects are not yet exact, they are given up only if
-they explain far less.
+add up to something outside the catalogue are not named (`halbach_fe.diagnosis.competing_causes`).
+In the first round, in which the signatures of large effects are not yet exact, they are given up
+only if they explain far less.
 
 Random errors of the probe's positions are noise rather than an effect: their size is estimated in
 every round, and the comparison is repeated with that noise until it no longer changes.
@@ -37,18 +37,21 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, NotConvergedError
-from halbach_fe.core.pace import Pace, Say, quiet
+from halbach_fe.core.progress import Pace, Say, quiet
+from halbach_fe.diagnosis.effect_comparison import (
+    Search,
+    identify_effects,
+    possible,
+    score_hypotheses,
+    with_further_causes,
+    with_rivals,
+    with_short_steps,
+)
+from halbach_fe.diagnosis.effect_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.flexible_causes import Family
-from halbach_fe.diagnosis.linearization import (
-    Linearization,
-    NominalSolver,
-    Signatures,
-    apply_effects,
-    moves_of,
-)
-from halbach_fe.diagnosis.map_errors import (
+from halbach_fe.diagnosis.gross_error_correction import (
     beside_amplitudes,
     blocks_of,
     correct_map_errors,
@@ -56,22 +59,18 @@ from halbach_fe.diagnosis.map_errors import (
     find_poses,
     possible_positions,
 )
+from halbach_fe.diagnosis.linearization import (
+    Linearization,
+    NominalSolver,
+    Signatures,
+    apply_effects,
+    moves_of,
+)
 from halbach_fe.diagnosis.marginal_evidence import (
     Marginal,
     ResidualGroup,
     loo_residuals,
     residual_groups,
-)
-from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
-from halbach_fe.diagnosis.naming import (
-    Further,
-    Judgement,
-    describe_unknown,
-    families_of,
-    imitated,
-    judge,
-    named_effects,
-    suspicions,
 )
 from halbach_fe.diagnosis.random_errors import (
     Outlier,
@@ -93,23 +92,24 @@ from halbach_fe.diagnosis.result import (
     UnknownCause,
     explain_by_solver_error,
 )
-from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import (
-    Search,
-    identify_effects,
-    possible,
-    score_hypotheses,
-    with_further_causes,
-    with_rivals,
-    with_short_steps,
-)
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.uncertain_effects import detection_limits, with_uncertain_effects
+from halbach_fe.diagnosis.verdict import (
+    Further,
+    Judgement,
+    describe_unknown,
+    families_of,
+    imitated,
+    judge,
+    named_effects,
+    suspicions,
+)
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Data, check_maps
+from halbach_fe.measurement.campaign_maps import Data, check_maps
 from halbach_fe.measurement.field_map import is_total_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
@@ -159,7 +159,7 @@ def diagnose(
     ----------
     data : Dataset or dict of str to Dataset
         The map, as `halbach_fe.measurement.field_map.read_map` returns it; or all maps that the
-        study lists, see `halbach_fe.measurement.campaign.read_maps`.
+        study lists, see `halbach_fe.measurement.campaign_maps.read_maps`.
     session : Session
         Its folder receives a subfolder for each round.
     blocks : BlockTable, optional

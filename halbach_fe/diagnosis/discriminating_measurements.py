@@ -33,20 +33,20 @@ from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign, keys_of
+from halbach_fe.diagnosis.scanned_maps import Campaign, keys_of
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
-from halbach_fe.measurement.campaign import Data
+from halbach_fe.measurement.campaign_maps import Data
 from halbach_fe.measurement.positions import motion
 from halbach_fe.response.block_variation import Deviations, vacuum_changes
 from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import NoiseCovariance, independent_noise
-from halbach_fe.study.inference import PROBE_KEYS
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import PROBE_KEYS
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

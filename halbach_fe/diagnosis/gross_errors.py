@@ -46,11 +46,11 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import probe_points, sensor_matrix, to_magnet_axes
+from halbach_fe.measurement.probe_law import probe_points, sensor_matrix, to_magnet_axes
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.separate_blocks import Field
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes, Component
 

@@ -18,7 +18,7 @@ from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene
+from halbach_fe.diagnosis.scanned_maps import Campaign, FieldAt, Scene
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.mesh import with_rough_mesh

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.instrument import to_magnet_axes
-from halbach_fe.study.array import check_order
+from halbach_fe.measurement.probe_law import to_magnet_axes
+from halbach_fe.study.array_keys import check_order
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes, Component
 
@@ -59,7 +59,7 @@ class MapConvention:
     """Units of the map in the study's units."""
     positions: Axes = IDENTITY_AXES
     fields: Axes = IDENTITY_AXES
-    """Axes of the columns, see `halbach_fe.study.measurement.Instrument`."""
+    """Axes of the columns, see `halbach_fe.study.measurement_keys.Instrument`."""
     magnet: ArrayVariant | None = None
     """The magnet that was measured in place of the study's."""
     radius: float = 1.0

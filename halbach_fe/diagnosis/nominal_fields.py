@@ -17,8 +17,8 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.inference.readings import unit_vectors
-from halbach_fe.measurement.instrument import (
+from halbach_fe.inference.campaign_readings import unit_vectors
+from halbach_fe.measurement.probe_law import (
     nonlinear_part,
     sensor_matrix,
     sensor_positions,
@@ -31,7 +31,7 @@ from halbach_fe.solver.exact_block_field import (
     unit_fields,
 )
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 
 

@@ -29,16 +29,16 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.numbers import MAD_TO_SD
+from halbach_fe.diagnosis.effect_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
 from halbach_fe.diagnosis.flexible_causes import DECAY_RATES, harmonic_fields, sensor_errors
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
-from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
-from halbach_fe.diagnosis.scene import Campaign, ScannedMap
+from halbach_fe.diagnosis.scanned_maps import Campaign, ScannedMap
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
-from halbach_fe.measurement.observation import TOTAL
+from halbach_fe.measurement.observation_operator import TOTAL
 from halbach_fe.measurement.reading_noise import readings_per_displacement
 from halbach_fe.stats.gaussian import NoiseCovariance
-from halbach_fe.study.inference import ExcludedReading, Inference
-from halbach_fe.study.measurement import NoiseSettings
+from halbach_fe.study.inference_keys import ExcludedReading, Inference
+from halbach_fe.study.measurement_keys import NoiseSettings
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

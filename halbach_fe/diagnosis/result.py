@@ -10,6 +10,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.interface import ShownInNotebook
+from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.marginal_evidence import (
@@ -18,13 +19,12 @@ from halbach_fe.diagnosis.marginal_evidence import (
     ResidualGroup,
     with_fewer_columns,
 )
-from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.random_errors import Outlier, PositionNoise
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.study.inference import InstrumentSd
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import InstrumentSd
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, rms
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
+from halbach_fe.diagnosis.effect_selection import Candidate
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
+from halbach_fe.diagnosis.gross_error_correction import with_poses
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
-from halbach_fe.diagnosis.map_errors import with_poses
-from halbach_fe.diagnosis.model_selection import Candidate
 from halbach_fe.diagnosis.random_errors import PositionNoise
 from halbach_fe.diagnosis.result import (
     DetectionLimits,
@@ -41,7 +41,7 @@ from halbach_fe.inference.result import (
     InferenceResult,
 )
 from halbach_fe.measurement.doubted_terms import factor_in_words
-from halbach_fe.measurement.instrument import row_order_note
+from halbach_fe.measurement.probe_law import row_order_note
 from halbach_fe.study.model import Study
 
 STUDY_FILE = "study.diagnosed.toml"

@@ -24,20 +24,20 @@ from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats, slices
 from halbach_fe.core.errors import StudyError
-from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Parameter, each_block
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
-from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
-from halbach_fe.diagnosis.linearization import Training, apply_effects
-from halbach_fe.diagnosis.model_selection import (
+from halbach_fe.diagnosis.effect_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,
     WIDE_PRIOR_FROM,
     WIDE_PRIOR_SD,
 )
+from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Parameter, each_block
+from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
+from halbach_fe.diagnosis.linearization import Training, apply_effects
 from halbach_fe.diagnosis.result import DetectionLimits, IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.study.inference import Uncertain, number_changes
+from halbach_fe.study.inference_keys import Uncertain, number_changes
 from halbach_fe.study.model import Study
 
 STEP = 1e-3

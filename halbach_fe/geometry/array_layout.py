@@ -22,7 +22,7 @@ from halbach_fe.core.arrays import Floats, polygon_area, unit_circle
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.outline import Outline, circle, closed_outline, trapezoid_corners
-from halbach_fe.study.array import Array, BlockException
+from halbach_fe.study.array_keys import Array, BlockException
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, SIZES, FreeBlocks, Shape
 from halbach_fe.study.materials import MU_0
 
@@ -191,7 +191,7 @@ def ring_limits(array: Array, dimension: int) -> list[tuple[float, float]]:
     """Return the z limits in m of every ring, without free blocks; they are infinite in 2D.
 
     Rings are stacked layer by layer, and each stack is centred at z = 0, see
-    `halbach_fe.study.array.Ring`.
+    `halbach_fe.study.array_keys.Ring`.
     """
     if dimension == 2:
         return [(-np.inf, np.inf)] * array.rings

@@ -63,7 +63,7 @@ class MagnetBlock:
     gradient: float = 0.0
     corner_loss: float = 0.0
     """Non-uniformity of the magnetization, see ``magnetization_gradient`` and ``inner_corner_loss``
-    of `halbach_fe.study.array.BlockException`."""
+    of `halbach_fe.study.array_keys.BlockException`."""
     mounted_from: tuple[int, int] | None = None
     """Ring and slot that the block was made for, if that is another place."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)

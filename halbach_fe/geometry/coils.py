@@ -9,7 +9,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, unit_circle
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.study.external import AnyCoil, PolygonCoil, Racetrack, RoundCoil
+from halbach_fe.study.external_keys import AnyCoil, PolygonCoil, Racetrack, RoundCoil
 
 
 def closest(coil: AnyCoil) -> float:

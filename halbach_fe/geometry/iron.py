@@ -25,7 +25,7 @@ from halbach_fe.geometry.surface import (
     distance_from_triangles,
     distance_from_tube,
 )
-from halbach_fe.study.iron import (
+from halbach_fe.study.iron_keys import (
     CHORDS,
     Iron,
     IronBody,

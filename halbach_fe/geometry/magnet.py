@@ -44,9 +44,9 @@ from halbach_fe.geometry.overlaps import (
     points_of_block,
 )
 from halbach_fe.geometry.surface import Body, Surroundings, surroundings
-from halbach_fe.study.array import Array
-from halbach_fe.study.external import AnyCoil, External, Neighbour
-from halbach_fe.study.iron import Iron, IronRing
+from halbach_fe.study.array_keys import Array
+from halbach_fe.study.external_keys import AnyCoil, External, Neighbour
+from halbach_fe.study.iron_keys import Iron, IronRing
 from halbach_fe.study.materials import Curve, Demagnetization
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS, look_like_mm

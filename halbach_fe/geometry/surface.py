@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, face_vectors
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
-from halbach_fe.study.iron import windings
+from halbach_fe.study.iron_keys import windings
 from halbach_fe.study.types import look_like_mm
 
 ON_SURFACE = 1e-8

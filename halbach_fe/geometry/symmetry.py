@@ -28,8 +28,8 @@ from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, at_heights, outline_contains, points_on
-from halbach_fe.study.array import MAX_FACTOR, Array, BlockException
-from halbach_fe.study.external import External
+from halbach_fe.study.array_keys import MAX_FACTOR, Array, BlockException
+from halbach_fe.study.external_keys import External
 
 _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers with well-mixed bits, which combine three rounded coordinates to a hash."""

@@ -16,7 +16,16 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsi
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import MeasuredPrior, prior_from_blocks
-from halbach_fe.inference.instrument_fit import (
+from halbach_fe.inference.campaign_readings import (
+    Noises,
+    Readings,
+    check_validation_map,
+    left_out,
+    overlaps,
+    read_campaign,
+    warn_of_another_gain,
+)
+from halbach_fe.inference.relinearization import (
     Beside,
     Magnitudes,
     OpenTerms,
@@ -26,15 +35,6 @@ from halbach_fe.inference.instrument_fit import (
     readings_of_field,
     warn_of_bent_readings,
 )
-from halbach_fe.inference.readings import (
-    Noises,
-    Readings,
-    check_validation_map,
-    left_out,
-    overlaps,
-    read_campaign,
-    warn_of_another_gain,
-)
 from halbach_fe.inference.result import (
     Amplitudes,
     InferenceResult,
@@ -43,15 +43,15 @@ from halbach_fe.inference.result import (
     Prediction,
 )
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.campaign_maps import Map, maps_of
 from halbach_fe.measurement.field_map import points_of, taking_arrays
-from halbach_fe.measurement.instrument import (
+from halbach_fe.measurement.observation_operator import Observation
+from halbach_fe.measurement.probe_law import (
     in_si_and_magnet_axes,
     probe_points,
     sensor_matrix,
     turn_of,
 )
-from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import (
     Deviations,
     distribution_of,
@@ -68,7 +68,7 @@ from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance, stacked_root, with_independent
 from halbach_fe.stats.posteriors import Rows, predict
-from halbach_fe.study.inference import Uncertain
+from halbach_fe.study.inference_keys import Uncertain
 from halbach_fe.study.model import Study
 
 ROUNDS, AT_REST = 16, 0.3
@@ -115,7 +115,7 @@ def infer(
         Skip the solve of the updated magnet that checks whether its iron is linear enough.
     validation_map : Dataset, optional
         Another map, which is predicted but does not update the model; see
-        `halbach_fe.measurement.observation.study_for_validation_map`.
+        `halbach_fe.measurement.observation_operator.study_for_validation_map`.
     say : callable, optional
         Takes a line of text about each update, if there are several: if terms of instruments are
         estimated, or |B| was read.

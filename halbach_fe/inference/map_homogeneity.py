@@ -34,16 +34,16 @@ from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.blocks import distance_from_blocks, present_blocks
 from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
-from halbach_fe.inference.instrument_fit import open_columns
-from halbach_fe.inference.readings import (
+from halbach_fe.inference.campaign_readings import (
     Readings,
     read_campaign,
     unit_vectors,
     warn_of_another_gain,
 )
+from halbach_fe.inference.relinearization import open_columns
 from halbach_fe.inference.result import HELD_OUT
-from halbach_fe.measurement.campaign import Map, maps_of
-from halbach_fe.measurement.harmonic_field import (
+from halbach_fe.measurement.campaign_maps import Map, maps_of
+from halbach_fe.measurement.source_free_field import (
     UNIFORM,
     HarmonicFit,
     fit_readings,

@@ -23,15 +23,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError, must_be
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.installation import code_digest
-from halbach_fe.core.untrusted import read_hdf5, with_checksum
+from halbach_fe.core.untrusted_files import read_hdf5, with_checksum
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
-from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
+from halbach_fe.measurement.campaign_maps import refuse_open_instruments, refuse_uncertain
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -335,10 +335,10 @@ def _resume(path: Path, key: str, runs: list[_Run], parameters: int) -> int:
         if state.attrs["key"] != key:
             return 0
         solves = int(state.attrs["solves"])
-        last = untrusted.finite_array(state["last"], (count, len(runs[0].last)))
-        accepted = untrusted.finite_array(state["accepted"], (count,))
+        last = untrusted_files.finite_array(state["last"], (count, len(runs[0].last)))
+        accepted = untrusted_files.finite_array(state["accepted"], (count,))
         stored = read_hdf5(path, "posterior")["magnetization"]
-        samples = untrusted.finite_array(stored, (count, stored.shape[1], parameters))
+        samples = untrusted_files.finite_array(stored, (count, stored.shape[1], parameters))
         generators = [np.random.default_rng() for _ in runs]
         states = json.loads(state.attrs["generators"])
         for generator, generator_state in zip(generators, states, strict=True):

@@ -23,10 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, box_middle, rms, spread
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.progress import Pace
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.instrument_fit import of_total_field, shown_less_read
+from halbach_fe.inference.campaign_readings import unit_vectors
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
 from halbach_fe.inference.pose_search import (
     LONGEST_M,
@@ -38,7 +38,7 @@ from halbach_fe.inference.pose_search import (
     right_angles,
     share_of,
 )
-from halbach_fe.inference.readings import unit_vectors
+from halbach_fe.inference.relinearization import of_total_field, shown_less_read
 from halbach_fe.measurement.doubted_terms import (
     UNITS,
     Term,
@@ -50,7 +50,13 @@ from halbach_fe.measurement.doubted_terms import (
     words_of,
 )
 from halbach_fe.measurement.field_map import is_total_field, points_of
-from halbach_fe.measurement.instrument import (
+from halbach_fe.measurement.observation_operator import (
+    excluded_components,
+    held_out_readings,
+    observe,
+    observe_total,
+)
+from halbach_fe.measurement.probe_law import (
     DIFFERENCE_M,
     NAMES,
     POSE,
@@ -67,12 +73,6 @@ from halbach_fe.measurement.instrument import (
     total_without_nonlinear_part,
     with_terms,
 )
-from halbach_fe.measurement.observation import (
-    excluded_components,
-    held_out_readings,
-    observe,
-    observe_total,
-)
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import (
     STEP,
@@ -84,8 +84,8 @@ from halbach_fe.response.block_variation import (
 from halbach_fe.solver.routes import field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, largest_directions, root_matrix
-from halbach_fe.study.inference import shifted
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import shifted
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 
 ITERATIONS = 25

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints, box_middle, spread
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.progress import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import UNDIRECTED_COLUMN
-from halbach_fe.measurement.instrument import DIFFERENCE_M
 from halbach_fe.measurement.map_check import WORTH_TRYING
+from halbach_fe.measurement.probe_law import DIFFERENCE_M
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
 SAME_M, SAME_RAD = 1e-3, 0.02

@@ -31,20 +31,20 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import check_number
-from halbach_fe.core.pace import QUIET_S, Pace, duration
+from halbach_fe.core.progress import QUIET_S, Pace, duration
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses, right_angles
-from halbach_fe.measurement.campaign import Map, refuse_unordered
+from halbach_fe.measurement.campaign_maps import Map, refuse_unordered
 from halbach_fe.measurement.doubted_terms import Term, doubts
 from halbach_fe.measurement.field_map import checked_map, directed, is_undirected, taking_arrays
-from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.measurement.map_join import MapPose
+from halbach_fe.measurement.probe_law import turn_of
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.inference import POSE_KEYS, PROBE_KEYS, InstrumentSd
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import POSE_KEYS, PROBE_KEYS, InstrumentSd
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 

@@ -23,7 +23,7 @@ from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import decimals, in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.measurement.campaign import ONLY_MAP
+from halbach_fe.measurement.campaign_maps import ONLY_MAP
 from halbach_fe.measurement.doubted_terms import (
     ALL_BLOCKS,
     UNLIKE,
@@ -40,13 +40,13 @@ from halbach_fe.measurement.doubted_terms import (
     shared_in_words,
     words_of,
 )
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.posteriors import contraction, row_slices, whitened
-from halbach_fe.study.inference import shifted
+from halbach_fe.study.inference_keys import shifted
 from halbach_fe.study.model import Study
 
 ALL_READINGS = "all"
@@ -364,7 +364,7 @@ class InferenceResult(ShownInNotebook):
     regions : tuple of str
         Noise region of each reading; among several maps with the name of its map.
     maps : tuple of str
-        Map of each reading, see `halbach_fe.measurement.campaign.Map`.
+        Map of each reading, see `halbach_fe.measurement.campaign_maps.Map`.
     response : Response
         The linear model of the readings.
     prior, posterior : Gaussian
@@ -398,8 +398,8 @@ class InferenceResult(ShownInNotebook):
     terms : InstrumentTerms or None
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
     amplitudes : Amplitudes or None
-        Uncertain amplitudes of the study, see `halbach_fe.study.inference.Uncertain`; None if there
-        are none.
+        Uncertain amplitudes of the study, see `halbach_fe.study.inference_keys.Uncertain`; None if
+        there are none.
     overlaps : tuple of Overlap
         How maps agree where they overlap.
     regions_left_out : tuple of LeftOut

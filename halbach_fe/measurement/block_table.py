@@ -20,7 +20,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.files import as_path, atomic, file_bytes
 from halbach_fe.core.interface import typed
-from halbach_fe.measurement.tables import check_columns, csv_table, finite, write_csv
+from halbach_fe.measurement.text_tables import check_columns, csv_table, finite, write_csv
 
 MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
 REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")

@@ -32,7 +32,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Floats, plain
 from halbach_fe.core.errors import (
     HalbachError,
@@ -45,8 +45,8 @@ from halbach_fe.core.files import as_path, atomic, file_bytes
 from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import decimals
 from halbach_fe.core.result_folder import single_file
-from halbach_fe.core.untrusted import hdf5_bytes
-from halbach_fe.measurement.tables import (
+from halbach_fe.core.untrusted_files import hdf5_bytes
+from halbach_fe.measurement.text_tables import (
     _check_printable,
     check_columns,
     csv_table,
@@ -464,7 +464,7 @@ def _write_vtu(data: xr.Dataset, path: Path) -> None:
 def _read_hdf5(path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        data = untrusted.read_dataset(path)
+        data = untrusted_files.read_dataset(path)
     except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
                                        f"'{error}'")) from None
@@ -552,7 +552,7 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
         with tempfile.NamedTemporaryFile(suffix=".vtu") as copy:  # meshio opens files by their name
             copy.write(raw)
             copy.flush()
-            mesh = untrusted.read_mesh(Path(copy.name))
+            mesh = untrusted_files.read_mesh(Path(copy.name))
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
         _check_names(xr.Dataset(dict.fromkeys(mesh.point_data, 0.0)), where)
         for name in (*TOTAL_COLUMNS, "time_s"):
@@ -797,7 +797,7 @@ def check_magnitudes(data: xr.Dataset) -> None:
     """Raise MeasurementError if a map's values are too large to be in m and T, or sigmas absurd.
 
     The study, not the map, states the units of the file; see `in_si_and_magnet_axes` in
-    `halbach_fe.measurement.instrument`.
+    `halbach_fe.measurement.probe_law`.
     """
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     farthest = float(np.abs(points_of(data)).max())

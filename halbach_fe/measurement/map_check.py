@@ -1,11 +1,11 @@
 """Maxwell's check of a field map: div B = 0, curl B = 0, and the instrument that this takes.
 
 The map is fitted by a field of sources outside the mapped region (`halbach_fe.measurement.
-harmonic_field`), of which no magnet is assumed. An instrument that exchanges axes, reverses signs,
-has its three sensors in three places or turns during the scan makes a map that no such field has;
-its parameters are fitted together with the field. What remains is the model-free floor: no model of
-a magnet explains the map any better, except within a spacing of the points from edges of magnets,
-where the sources outside follow the field less well.
+source_free_field`), of which no magnet is assumed. An instrument that exchanges axes, reverses
+signs, has its three sensors in three places or turns during the scan makes a map that no such field
+has; its parameters are fitted together with the field. What remains is the model-free floor: no
+model of a magnet explains the map any better, except within a spacing of the points from edges of
+magnets, where the sources outside follow the field less well.
 
 Some errors no map can show by itself: a common factor or sign of all components, a shift of the
 whole map, a uniform offset, and a position axis that counts backwards (the map of a mirrored
@@ -28,7 +28,7 @@ from halbach_fe.core.arrays import Floats, Ints, rms, spread
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
-from halbach_fe.core.pace import Pace, Progress
+from halbach_fe.core.progress import Pace, Progress
 from halbach_fe.measurement.doubted_terms import doubted_from
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
@@ -39,7 +39,6 @@ from halbach_fe.measurement.field_map import (
     refuse_undirected,
     warn_of_millimetres,
 )
-from halbach_fe.measurement.harmonic_field import NO_FIT, Charges, HarmonicFit, spacing_of
 from halbach_fe.measurement.positions import (
     HELD_OUT_EVERY,
     held_out_lines,
@@ -47,7 +46,7 @@ from halbach_fe.measurement.positions import (
     point_spacing,
     scan_lines,
 )
-from halbach_fe.measurement.probe_in_field import (
+from halbach_fe.measurement.probe_fit import (
     COARSE_WAVES,
     FEW_ITERATIONS,
     GAINS,
@@ -65,6 +64,7 @@ from halbach_fe.measurement.probe_in_field import (
     fit_probe,
     scatter_of,
 )
+from halbach_fe.measurement.source_free_field import NO_FIT, Charges, HarmonicFit, spacing_of
 from halbach_fe.measurement.suspect_rows import (
     at_border,
     broken_rows,

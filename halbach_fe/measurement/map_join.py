@@ -28,19 +28,9 @@ from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
-from halbach_fe.core.pace import Pace, Progress
-from halbach_fe.measurement.campaign import refuse_shared
+from halbach_fe.core.progress import Pace, Progress
+from halbach_fe.measurement.campaign_maps import refuse_shared
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
-from halbach_fe.measurement.joined_probe import (
-    GAIN,
-    PLACED_SD,
-    TERMS,
-    TURN_RAD,
-    JoinedModel,
-    Pose,
-    PosedCharges,
-)
 from halbach_fe.measurement.map_check import (
     FAR_OFF,
     MOST_POINTS,
@@ -61,8 +51,17 @@ from halbach_fe.measurement.map_check import (
     selected,
     some_lines,
 )
+from halbach_fe.measurement.map_join_fit import (
+    GAIN,
+    PLACED_SD,
+    TERMS,
+    TURN_RAD,
+    JoinedModel,
+    Pose,
+    PosedCharges,
+)
 from halbach_fe.measurement.positions import scan_lines
-from halbach_fe.measurement.probe_in_field import (
+from halbach_fe.measurement.probe_fit import (
     LAG,
     MATRICES,
     MIXING,
@@ -75,6 +74,7 @@ from halbach_fe.measurement.probe_in_field import (
     fit_probe,
     from_middle,
 )
+from halbach_fe.measurement.source_free_field import Charges, fit_fields, spacing_of
 from halbach_fe.study.types import COMPONENTS
 
 FEWEST_SHARED = 40

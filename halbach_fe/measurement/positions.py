@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.study.measurement import GridPositions, Positions
+from halbach_fe.study.measurement_keys import GridPositions, Positions
 
 
 def points_from(positions: Positions) -> Floats:

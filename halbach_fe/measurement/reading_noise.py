@@ -1,4 +1,4 @@
-"""Noise covariance of readings: the noise stated by map or study, and uncertain positions."""
+"""The noise of readings: a covariance of what map or study states, and of uncertain positions."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import TOTAL_SIGMA_COLUMN, is_total_field
-from halbach_fe.measurement.instrument import probe_points, sensor_matrix
-from halbach_fe.measurement.observation import TOTAL, Observation
+from halbach_fe.measurement.observation_operator import TOTAL, Observation
+from halbach_fe.measurement.probe_law import probe_points, sensor_matrix
 from halbach_fe.solver.exact_block_field import external_gradient, gradient_of
 from halbach_fe.stats.gaussian import NoiseCovariance
-from halbach_fe.study.measurement import NoiseSettings
+from halbach_fe.study.measurement_keys import NoiseSettings
 
 ROUNDING = 1e-12
 """Correlation coefficient below which readings count as independent. Sums over the points of a

@@ -18,7 +18,7 @@ from scipy.special import gammainc
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.progress import Pace
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
     check_magnitudes,

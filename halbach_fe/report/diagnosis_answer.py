@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from halbach_fe.diagnosis.effect_selection import DETECTION_LOG_ODDS, MAX_EFFECTS
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import place_of
-from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, MAX_EFFECTS
 from halbach_fe.diagnosis.result import (
     Diagnosis,
     IdentifiedEffect,

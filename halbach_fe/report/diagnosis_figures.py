@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.diagnosis.effect_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.marginal_evidence import ResidualGroup
-from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import label_in_words, place_in_words, rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult

@@ -10,7 +10,7 @@ from halbach_fe.core.arrays import Bools, Floats, Ints, rms
 from halbach_fe.inference.registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer, along_the_axis
-from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
+from halbach_fe.report.multipoles_page import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
     decimals,
     faults_in_words,

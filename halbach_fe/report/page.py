@@ -37,9 +37,9 @@ from halbach_fe.core.installation import version
 from halbach_fe.core.interface import typed
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.campaign import with_paths_from
+from halbach_fe.measurement.campaign_maps import with_paths_from
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.measurement.tables import write_csv
+from halbach_fe.measurement.text_tables import write_csv
 from halbach_fe.report.answer import (
     DPI,
     SMALLEST_PT,
@@ -52,7 +52,7 @@ from halbach_fe.report.answer import (
 from halbach_fe.report.words import faults_in_words, listed
 from halbach_fe.study.model import Study, is_nonlinear
 from halbach_fe.study.reader import read_study
-from halbach_fe.study.study_file import study_text, write_edited
+from halbach_fe.study.writer import study_text, write_edited
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
@@ -213,14 +213,16 @@ def last_sections(figures: Figures, model: Mapping[str, str]) -> list[Section]:
 
 
 PAGES = {
-    "Assembly": "assembly", "SimulatedCampaign": "campaign",
-    "DemagnetizationMap": "demagnetization", "Diagnosis": "diagnosis", "FieldOnLines": "field",
-    "Forces": "forces", "HomogeneityResult": "homogeneity", "InferenceResult": "inference",
-    "MapCheck": "map_check", "JoinedMaps": "map_check", "MultipoleTables": "multipoles",
-    "MeasurementPlan": "plan", "MeasuredPrior": "prior", "Designed": "ring_design",
-    "FilledTray": "shim_tray", "Shim": "shimming", "Solution": "solution",
-    "SortedBlocks": "sorting", "Tolerance": "tolerance", "HomogeneityTolerance": "tolerance",
-    "Verification": "verification"}
+    "Assembly": "assembly_page", "SimulatedCampaign": "simulated_campaign_page",
+    "DemagnetizationMap": "demagnetization_page", "Diagnosis": "diagnosis_page",
+    "FieldOnLines": "field_page", "Forces": "forces_page",
+    "HomogeneityResult": "homogeneity_page", "InferenceResult": "inference_page",
+    "MapCheck": "map_check_page", "JoinedMaps": "map_check_page",
+    "MultipoleTables": "multipoles_page", "MeasurementPlan": "plan_page",
+    "MeasuredPrior": "prior_page", "Designed": "ring_design_page",
+    "FilledTray": "shim_tray_page", "Shim": "shimming_page", "Solution": "solution_page",
+    "SortedBlocks": "sorting_page", "Tolerance": "tolerance_page",
+    "HomogeneityTolerance": "tolerance_page", "Verification": "verification_page"}
 """Module of this room whose function ``page`` returns the page of each result."""
 
 

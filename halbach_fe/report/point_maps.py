@@ -29,7 +29,7 @@ from halbach_fe.inference.result import (
     InferenceResult,
     Prediction,
 )
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.measurement.positions import point_spacing
 from halbach_fe.report.page import (
     IRON,

@@ -1,16 +1,16 @@
 """Readings of what deviates besides uniform magnetizations: variations in blocks, and amplitudes.
 
 The magnetization along a block's easy axis deviates from a uniform one by a smooth random function
-of the place, see ``variation_sd`` of `halbach_fe.study.inference.Prior`. Most of what it can be
-makes no field where a probe can be. Each block therefore gets as many modes as change the field in
-the bore noticeably: the singular vectors of the field on a cylinder near the blocks, weighted by
+of the place, see ``variation_sd`` of `halbach_fe.study.inference_keys.Prior`. Most of what it can
+be makes no field where a probe can be. Each block therefore gets as many modes as change the field
+in the bore noticeably: the singular vectors of the field on a cylinder near the blocks, weighted by
 the prior. Amplitudes are in prior standard deviations. The field is that of small uniform parts of
 the block in vacuum. What permeable blocks answer to it is neglected, some 5 % of a variation that
 is small itself.
 
-An uncertain amplitude (`halbach_fe.study.inference.Uncertain`) is a parameter of the magnet after
-its magnetizations, in units of its prior standard deviation. The magnetization is always that of
-the blocks: if an amplitude changes what blocks are expected to have (a temperature), it is a
+An uncertain amplitude (`halbach_fe.study.inference_keys.Uncertain`) is a parameter of the magnet
+after its magnetizations, in units of its prior standard deviation. The magnetization is always that
+of the blocks: if an amplitude changes what blocks are expected to have (a temperature), it is a
 deviation that they share in the prior, and its own column has only what the amplitude changes at
 given magnetizations.
 
@@ -36,7 +36,7 @@ from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet, neighbour_blocks
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction
@@ -52,7 +52,7 @@ from halbach_fe.stats.gaussian import (
     stacked_root,
     with_independent,
 )
-from halbach_fe.study.inference import Uncertain, shifted
+from halbach_fe.study.inference_keys import Uncertain, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, of_length
 from halbach_fe.core.interface import ShownInNotebook
-from halbach_fe.core.pace import Say, quiet
+from halbach_fe.core.progress import Say, quiet
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import Observation, fourier_analysis
+from halbach_fe.measurement.observation_operator import Observation, fourier_analysis
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.solver.azimuthal_modes import modes_needed, solve_modes
@@ -30,7 +30,7 @@ from halbach_fe.solver.routes import (
     solve_nominal,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
-from halbach_fe.study.measurement import FourierCoefficients
+from halbach_fe.study.measurement_keys import FourierCoefficients
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 REFINEMENT = 1.5

@@ -34,7 +34,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
-from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.measurement.observation_operator import flux_density_at
 from halbach_fe.response.block_variation import neighbour_columns, neighbour_remanences
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
@@ -51,7 +51,7 @@ from halbach_fe.solver.separate_blocks import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 
 
 @dataclass(frozen=True)

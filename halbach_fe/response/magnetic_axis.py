@@ -31,8 +31,8 @@ from scipy import optimize
 from halbach_fe.core.arrays import Floats, unit_circle
 from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
-from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.measurement.observation_operator import flux_density_at
+from halbach_fe.measurement.source_free_field import solid_harmonic_fields
 from halbach_fe.response.block_variation import (
     Deviations,
     distribution_of,

@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
 from halbach_fe.core.installation import code_digest, version
-from halbach_fe.core.untrusted import read_hdf5, with_checksum, write_hdf5
+from halbach_fe.core.untrusted_files import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.response.block_variation import (
     Variations,
     amplitude_names,
@@ -411,16 +411,16 @@ def _read(path: Path, key: str) -> Response | None:
             return None
         names = tuple(map(str, data["parameter"].values))
         readings, parameters = (len(data["offset"]),), (len(names),)
-        matrix = (untrusted.finite_array(data["H"], readings + parameters) if "H" in data
+        matrix = (untrusted_files.finite_array(data["H"], readings + parameters) if "H" in data
                   else StoredMatrix.at(_beside(path, key), readings + parameters,
                                        str(data.attrs["matrix_sha256"])))
         return Response(matrix, names,
-                        untrusted.finite_array(data["nominal"], parameters),
-                        untrusted.finite_array(data["offset"], readings),
-                        untrusted.finite_array(data["error"], readings),
+                        untrusted_files.finite_array(data["nominal"], parameters),
+                        untrusted_files.finite_array(data["offset"], readings),
+                        untrusted_files.finite_array(data["error"], readings),
                         float(data.attrs["superposition_error"]),
                         of_similar=bool(data.attrs["of_similar"]), reused=True,
-                        shared_error=untrusted.finite_array(
+                        shared_error=untrusted_files.finite_array(
                             data["shared_error"], (data.sizes["change"], *readings)))
     except FileNotFoundError:
         return None

@@ -37,8 +37,13 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.coils import crosses_disc, distance_from_axis, distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
-from halbach_fe.measurement.campaign import SAME_PLACE_M
-from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
+from halbach_fe.measurement.campaign_maps import SAME_PLACE_M
+from halbach_fe.measurement.observation_operator import (
+    Observation,
+    concatenate,
+    fourier_analysis,
+    observe,
+)
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import (
     Deviations,
@@ -50,9 +55,9 @@ from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
+from halbach_fe.study.measurement_keys import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS
 
 Complexes = NDArray[np.complex128]

@@ -37,12 +37,12 @@ import scipy.sparse.linalg as sparse_linalg
 from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.response.block_variation import prior_of_blocks
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.solver.dofs import check_difference, factorize
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.solver.getdp_files import check_difference, factorize
 from halbach_fe.solver.interpolation import locate, quadrature
 from halbach_fe.solver.magnetostatics import assemble, solve_samples
 from halbach_fe.solver.routes import (

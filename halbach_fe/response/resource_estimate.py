@@ -31,7 +31,7 @@ from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, variants_to_compare
 from halbach_fe.response.matrix import LOADED_BYTES

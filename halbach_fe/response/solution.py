@@ -15,7 +15,7 @@ from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.measurement.observation import Observation, observe
+from halbach_fe.measurement.observation_operator import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.stray_field import StrayField, stray_field

@@ -26,7 +26,7 @@ from halbach_fe.response.block_variation import Deviations, distribution_of, wit
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 
 LIMIT_T = 5e-4
 """Flux density above which people with pacemakers must not be (IEC 60601-2-33): 5 gauss."""

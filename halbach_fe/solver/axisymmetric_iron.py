@@ -50,7 +50,7 @@ from halbach_fe.core.threads import return_memory
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.azimuthal_modes import to_cartesian
-from halbach_fe.solver.dofs import factorize
+from halbach_fe.solver.getdp_files import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_modes import (
     Asked,

@@ -36,8 +36,8 @@ from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, s
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
-from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import DIRECT_SOLVER_OF_PLANE, Job
+from halbach_fe.solver.getdp_files import read_solutions, read_unknowns
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,

@@ -59,7 +59,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, ring_radii
 from halbach_fe.solver.field_kernels import arc_table, cuboid_fields, outline_fields
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.study.external import AnyCoil, Neighbour, Racetrack, RoundCoil, check_apart
+from halbach_fe.study.external_keys import AnyCoil, Neighbour, Racetrack, RoundCoil, check_apart
 from halbach_fe.study.materials import MU_0
 
 _AT_ONCE = 100_000

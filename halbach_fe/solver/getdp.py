@@ -141,7 +141,7 @@ class Job:
     solutions: str | None = None
     matrix: str | None = None
     """Files to which PETSc writes the solution of every linear system, and the matrix of the last
-    one; `halbach_fe.solver.dofs` reads them. None if they are not wanted."""
+    one; `halbach_fe.solver.getdp_files` reads them. None if they are not wanted."""
     unknowns: int | None = None
     """Number of unknowns that the system must have; None if it is not known in advance."""
     solves: int = 1

@@ -32,7 +32,7 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Bools, Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, PointsOutsideError
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.dofs import Unknowns
+from halbach_fe.solver.getdp_files import Unknowns
 from halbach_fe.solver.mesh import VerifiedMesh
 
 SEARCHES = ((12, 1e-8), (128, 1e-8), (1024, 1e-8), (128, 0.05))

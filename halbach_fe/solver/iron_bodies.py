@@ -45,9 +45,9 @@ from halbach_fe.solver.axisymmetric_iron import (
     excess_in,
     newton,
 )
-from halbach_fe.solver.dofs import Unknowns, check_difference, factorize
 from halbach_fe.solver.field_kernels import DEEPEST, NEAR, add_field, sweep
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
+from halbach_fe.solver.getdp_files import Unknowns, check_difference, factorize
 from halbach_fe.solver.interpolation import (
     QUADRATURE,
     cubic_slopes,
@@ -547,7 +547,7 @@ def _assembled(asked: Asked[Problem]) -> Problem:
 
 def key_of(magnet: Magnet, session: Session, coarseness: float) -> tuple[object, ...]:
     """Return what the problem of a magnet's iron depends on."""
-    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+    from halbach_fe.geo.iron_mesh import Sizes  # imports Gmsh
 
     sizes = Sizes.of(magnet.study.mesh, coarseness)
     return magnet.study.iron, magnet.array_half_length, sizes, session.getdp
@@ -561,7 +561,7 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
 
 def _assemble(magnet: Magnet, session: Session, coarseness: float) -> Problem:
     """Assemble the problem, as `assemble_bodies` does."""
-    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
+    from halbach_fe.geo.iron_mesh import Sizes, mesh_iron  # imports Gmsh
 
     shells, sizes = [], Sizes.of(magnet.study.mesh, coarseness)
 
@@ -614,7 +614,7 @@ def check_matrix(problem: Problem, surface: Ints, solution: Floats) -> None:
 
 def size_of(magnet: Magnet, coarseness: float) -> RunSize:
     """Estimate the size of the run for a magnet's iron, without meshing it."""
-    from halbach_fe.geo.iron_bodies import Sizes
+    from halbach_fe.geo.iron_mesh import Sizes
 
     elements, unknowns = Sizes.of(magnet.study.mesh, coarseness).count(magnet.iron)
     return RunSize("scalar_potential", elements, unknowns, 1)
@@ -625,7 +625,7 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
 
     ``known`` is the number of unknowns once it is meshed. Before, the estimate may be a third low.
     """
-    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+    from halbach_fe.geo.iron_mesh import Sizes  # imports Gmsh
 
     gib_each, mesh = 26_000 / 2**30, magnet.study.mesh  # memory per unknown
     estimate, available = size_of(magnet, coarseness).unknowns, available_memory()

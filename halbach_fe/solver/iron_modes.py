@@ -53,7 +53,8 @@ from halbach_fe.solver.azimuthal_modes import (
     modes_needed,
     unknowns_of,
 )
-from halbach_fe.solver.dofs import (
+from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.getdp_files import (
     Unknowns,
     check_difference,
     factorize,
@@ -61,7 +62,6 @@ from halbach_fe.solver.dofs import (
     read_solutions,
     read_unknowns,
 )
-from halbach_fe.solver.getdp import Job
 from halbach_fe.solver.interpolation import Located, coordinates, grid_operators, nodal_operators
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, variants_of
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files

@@ -46,8 +46,14 @@ from halbach_fe.core.files import make_folder
 from halbach_fe.core.installation import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.dofs import Unknowns, read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.getdp_files import (
+    Unknowns,
+    read_matrix,
+    read_saved,
+    read_solutions,
+    read_unknowns,
+)
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,

@@ -16,7 +16,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError, must_be
 from halbach_fe.core.threads import available_memory
@@ -290,7 +290,7 @@ def _read(path: Path) -> meshio.Mesh:
             raw):
         raise MeshError(f"Mesh {path} is truncated; mesh the study again.")
     try:
-        mesh = untrusted.read_mesh(path)
+        mesh = untrusted_files.read_mesh(path)
     except ValueError as error:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
     if not np.isfinite(mesh.points).all():

@@ -49,7 +49,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import CELLS_PER_SIDE
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, of_length
 from halbach_fe.core.errors import HalbachError
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.axisymmetric_iron import (
@@ -43,7 +43,7 @@ from halbach_fe.solver.moments.solve import (
     solve_irreversible,
 )
 from halbach_fe.solver.session import RunSize, Session
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 
 MANY_BLOCKS = 64
 """Number of blocks from which their field on the iron is summed by expansions."""
@@ -213,7 +213,7 @@ def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
     if magnet.iron_is_axisymmetric:
         check_bodies(magnet.iron)
         return []
-    from halbach_fe.geo.iron_bodies import check_apart  # imports Gmsh
+    from halbach_fe.geo.iron_mesh import check_apart  # imports Gmsh
 
     check_apart(magnet.name, magnet.iron)
     rough = estimate or _permeable(magnet.blocks)
@@ -222,7 +222,7 @@ def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
 
 def sizes_in_iron(magnet: Magnet) -> list[float]:
     """Return the sizes in m of the elements in bodies of iron of any shape."""
-    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+    from halbach_fe.geo.iron_mesh import Sizes  # imports Gmsh
 
     sizes = Sizes.of(magnet.study.mesh)
     return [sizes.of_body(body) for body in magnet.iron]

@@ -48,7 +48,7 @@ from halbach_fe.core.files import (
 from halbach_fe.core.installation import import_extra
 from halbach_fe.core.interface import typed
 from halbach_fe.core.numbers import check_number
-from halbach_fe.core.pace import Progress, Say, quiet
+from halbach_fe.core.progress import Progress, Say, quiet
 from halbach_fe.core.result_folder import is_run_folder, locked_folder
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import NO_GETDP, GetDP, Job, Run, getdp_or_none

@@ -22,7 +22,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import OutputError, StudyError, must_be, not_utf8
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
@@ -35,7 +35,7 @@ from halbach_fe.core.numbers import (
     other_separator,
     parse_number,
 )
-from halbach_fe.core.untrusted import write_hdf5
+from halbach_fe.core.untrusted_files import write_hdf5
 from halbach_fe.study.materials import Material, columns_with_grades
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
@@ -125,7 +125,7 @@ class FreeBlocks(StudyModel):
     ``material`` names a grade of magnet, whose remanence is along the block's own x axis.
     ``recoil_permeability`` holds along the remanence, ``recoil_permeability_across`` perpendicular
     to it. ``magnetization_gradient`` and ``inner_corner_loss`` are those of
-    `halbach_fe.study.array.BlockException`, for shapes of four edges.
+    `halbach_fe.study.array_keys.BlockException`, for shapes of four edges.
 
     ``ring`` and ``slot`` number the blocks for exceptions, priors and pictures. Without them,
     blocks of the same height z form a ring, and slots are counted by their angle about the z axis.
@@ -536,7 +536,7 @@ def _csv(raw: bytes, where: str) -> _Content:
 def _hdf5(path: Path, where: str) -> _Content:
     """Return the cells of an HDF5 file, numbers or text, "" or NaN where they are empty."""
     try:
-        data = untrusted.read_dataset(path)
+        data = untrusted_files.read_dataset(path)
     except ValueError as error:
         raise StudyError(must_be("content", where, "an HDF5 file of numbers and text",
                                  f"'{error}'")) from None

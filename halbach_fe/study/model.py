@@ -1,4 +1,4 @@
-"""The study: a validated description of a magnet, its discretization and its measurement.
+"""The whole study of all keys: a magnet, its discretization (mesh, solver) and its measurement.
 
 The names of keys end with their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors.
 The models are immutable: every result is a function of the study (and of measured data).
@@ -20,10 +20,10 @@ from pydantic import Field, ValidationError, model_validator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.array import Array, common_material, remanence_sds
-from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
-from halbach_fe.study.external import External
-from halbach_fe.study.inference import (
+from halbach_fe.study.array_keys import Array, common_material, remanence_sds
+from halbach_fe.study.design_keys import Design, Holder, HomogeneityRegion, ShimTray
+from halbach_fe.study.external_keys import External
+from halbach_fe.study.inference_keys import (
     POSE_KEYS,
     PROBE_KEYS,
     Inference,
@@ -34,9 +34,9 @@ from halbach_fe.study.inference import (
     Uncertain,
     check_uncertain,
 )
-from halbach_fe.study.iron import Iron, IronCurve, IronRing
+from halbach_fe.study.iron_keys import Iron, IronCurve, IronRing
 from halbach_fe.study.materials import Curve, Demagnetization, grade, grade_of
-from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
+from halbach_fe.study.measurement_keys import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.types import (
     COMPONENTS,
     MAX_LENGTH_M,

@@ -28,7 +28,14 @@ from halbach_fe.core.files import as_path
 from halbach_fe.core.interface import typed
 from halbach_fe.study import materials
 from halbach_fe.study.free_blocks import MAX_PATH, free_blocks_of_file
-from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
+from halbach_fe.study.iron_keys import (
+    Iron,
+    IronBody,
+    IronCurve,
+    TableCurve,
+    closed_surface,
+    read_stl,
+)
 from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import reason, sentence
 

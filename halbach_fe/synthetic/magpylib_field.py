@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, slices
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.installation import import_extra
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.shapes import (
     CylinderBody,

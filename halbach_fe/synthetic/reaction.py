@@ -42,7 +42,7 @@ from scipy.spatial import cKDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import CheckFailedError, StudyError, must_be
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic import ngsolve_reaction
 from halbach_fe.synthetic.magpylib_field import (

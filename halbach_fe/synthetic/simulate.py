@@ -25,17 +25,16 @@ from halbach_fe.core.arrays import Floats, spread
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.interface import ShownInNotebook
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
 from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import noise_regions
-from halbach_fe.study.external import check_apart
+from halbach_fe.study.external_keys import check_apart
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.synthetic.bodies import beside_magnet, magnet_of
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
@@ -70,6 +69,7 @@ from halbach_fe.synthetic.true_magnet import (
     in_words,
     vector,
 )
+from halbach_fe.synthetic.true_magnet_of_study import beside_magnet, magnet_of
 
 COIL_SD = 0.001
 """Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""

@@ -24,8 +24,8 @@ from halbach_fe.geometry.overlaps import SQUEEZED, Bodies, first_overlap
 from halbach_fe.geometry.surface import distance_from_prism, distance_from_tube
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study import materials
-from halbach_fe.study.external import External
-from halbach_fe.study.iron import Iron, IronMaterial
+from halbach_fe.study.external_keys import External
+from halbach_fe.study.iron_keys import Iron, IronMaterial
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.shapes import (

@@ -27,12 +27,12 @@ from calibration_page import page
 from truth_ranks import Sampler, Simulator, ranks, uniformity
 
 from halbach_fe.cli import common
-from halbach_fe.cli.options import positive, positive_number
+from halbach_fe.cli.shared_options import positive, positive_number
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.mcmc import LAPLACE_STEPS, PRIOR_STEP
-from halbach_fe.measurement.observation import Observation, observe
+from halbach_fe.measurement.observation_operator import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.page import write_files

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.pace import Progress, quiet
+from halbach_fe.core.progress import Progress, quiet
 from halbach_fe.stats.gaussian import Gaussian
 
 Simulator = Callable[[Floats, np.random.Generator], Floats]

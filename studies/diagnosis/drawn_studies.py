@@ -18,11 +18,11 @@ from halbach_fe.core.installation import import_extra
 from halbach_fe.measurement.positions import motion, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.hidden_effects.effect_types import Site, site_of
 from halbach_fe.synthetic.shapes import CylinderBody, PrismBody
 from halbach_fe.synthetic.true_magnet import Body
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 Generator = np.random.Generator
 Keys = dict[str, Any]

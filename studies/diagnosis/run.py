@@ -43,12 +43,12 @@ from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, HalbachError, StudyError
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effect_selection import best_factors
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
 from halbach_fe.diagnosis.linearization import NominalSolver, Training
-from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, InferenceResult
@@ -60,10 +60,9 @@ from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference import HeldOut
+from halbach_fe.study.inference_keys import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, site_of
 from halbach_fe.synthetic.simulate import (
@@ -74,6 +73,7 @@ from halbach_fe.synthetic.simulate import (
     true_field,
     with_hidden,
 )
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0

@@ -40,7 +40,7 @@ from halbach_fe.inference.pose_result import OpenKey, PosePrior, Registration
 from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report import diagnosis, registration
+from halbach_fe.report import diagnosis_page, registration_page
 from halbach_fe.report.answer import Answer as PageAnswer
 from halbach_fe.report.page import (
     MEASURED,
@@ -56,7 +56,7 @@ from halbach_fe.report.page import (
     write_files,
 )
 from halbach_fe.report.point_maps import draw_cross_section
-from halbach_fe.report.registration import place_table, pose_table
+from halbach_fe.report.registration_page import place_table, pose_table
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import read_study
 
@@ -412,7 +412,7 @@ def run(arguments: argparse.Namespace) -> int:
             common.say(sentence)
         common.print_table([{name: row[name] for name in TERMINAL_COLUMNS} for row in rows],
                            "Median relative error of B_x at held-out readings")
-        for name, page in (("registration", registration.page(read_study(STUDY), data, poses)),
+        for name, page in (("registration", registration_page.page(read_study(STUDY), data, poses)),
                            ("inferred", page_beside_the_paper(best.update, published, ()))):
             command = page.answer.command.replace("DIR/", f"DIR/{name}/").replace(
                 " MAP", f" DIR/{measured.name}")
@@ -470,7 +470,7 @@ def diagnosed(
     """Diagnose the registered study, write its page, return what it says first."""
     study = best.registration.study
     found = diagnose(study, data, session, say=common.say)
-    page = diagnosis.page(found, separations(found, data, session), study)
+    page = diagnosis_page.page(found, separations(found, data, session), study)
     write_files(page, folder, STUDY)
     common.say(page.answer.said)
     return [page.answer.said, page.answer.trust]

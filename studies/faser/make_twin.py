@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from halbach_fe.measurement.field_map import save_map
-from halbach_fe.study.measurement import FluxDensity, LinePositions
+from halbach_fe.study.measurement_keys import FluxDensity, LinePositions
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.simulate import simulate_campaign, write_campaign
 

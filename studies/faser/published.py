@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import TRAINING, InferenceResult
-from halbach_fe.report import inference
+from halbach_fe.report import inference_page
 from halbach_fe.report.page import (
     PUBLISHED,
     Drawn,
@@ -85,7 +85,7 @@ def page(
     result: InferenceResult, published: PublishedErrors, assumptions: Sequence[str]
 ) -> Page:
     """Return the page of an update, with the paper's errors beside ours, and what both rest on."""
-    made, figure = inference.page(result), "relative_error.png"
+    made, figure = inference_page.page(result), "relative_error.png"
     return replace(
         made, figures={**made.figures, figure: (
             partial(relative_error_figure, result, published), "Relative error of the predictions "

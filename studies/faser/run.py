@@ -17,7 +17,7 @@ import numpy as np
 from published import PublishedErrors, median_table, page
 
 from halbach_fe.cli import common
-from halbach_fe.cli.options import positive_number
+from halbach_fe.cli.shared_options import positive_number
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer

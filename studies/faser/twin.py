@@ -22,13 +22,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
-from halbach_fe.measurement.observation import observe
-from halbach_fe.report.inference import page
+from halbach_fe.measurement.observation_operator import observe
+from halbach_fe.report.inference_page import page
 from halbach_fe.report.page import write_files
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.posteriors import predict
-from halbach_fe.study.measurement import FluxDensity, PointPositions
+from halbach_fe.study.measurement_keys import FluxDensity, PointPositions
 from halbach_fe.study.reader import read_study
 
 sys.path.append(str(Path(__file__).parents[1]))  # for what several studies share

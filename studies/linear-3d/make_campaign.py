@@ -14,9 +14,9 @@ import numpy as np
 from halbach_fe.measurement.field_map import field_map, save_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import draw_magnet, model_of, true_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 HERE = Path(__file__).parent
 SEED = 3

@@ -20,11 +20,11 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.storage import write_inference
+from halbach_fe.inference.posterior_files import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.measurement import FourierCoefficients
+from halbach_fe.study.measurement_keys import FourierCoefficients
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 

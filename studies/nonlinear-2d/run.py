@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
-from halbach_fe.cli.options import positive
+from halbach_fe.cli.shared_options import positive
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import build_magnet

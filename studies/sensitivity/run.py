@@ -22,10 +22,10 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import MU_0
 from halbach_fe.design.measurement_plan import plan_measurement
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_files
-from halbach_fe.report.plan import page, plan_summary
+from halbach_fe.report.plan_page import page, plan_summary
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.routes import choose_route

@@ -169,7 +169,7 @@ def test_a_report_replaces_no_other_result(dipole, tmp_path):
 
 def test_every_result_has_a_command():
     from halbach_fe.cli.verbs import VERBS
-    from halbach_fe.report.campaign_folders import ORDER
+    from halbach_fe.report.joint_report_folders import ORDER
     from halbach_fe.report.page import PAGES
 
     named = [re.findall(r' Page\(\s*"([a-z-]+)"', inspect.getsource(

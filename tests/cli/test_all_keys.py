@@ -16,7 +16,7 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import EXIT_CODES
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_mesh import Sizes
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.symmetry import as_meant, mountings
@@ -26,7 +26,7 @@ from halbach_fe.measurement.field_map import field_map, points_of, read_map, wri
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.solver.iron_modes import Resolution
-from halbach_fe.study.array import Array
+from halbach_fe.study.array_keys import Array
 from halbach_fe.study.free_blocks import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import read_study
 from tests.conftest import changed

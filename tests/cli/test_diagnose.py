@@ -335,7 +335,7 @@ def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
 ):
     """Were a gap found to be negative, no study could hold it."""
     gap = next(one for one in catalogue() if one.name == "azimuthal_gap")
-    monkeypatch.setattr("halbach_fe.report.diagnosis.changed_studies", lambda study, _: [
+    monkeypatch.setattr("halbach_fe.report.diagnosis_page.changed_studies", lambda study, _: [
         (gap.apply(study, gap.places(study)[0], [-1e-4]), "a gap")])
     monkeypatch.setattr("halbach_fe.diagnosis.diagnose.describe_unknown", lambda *_: None)
     out = tmp_path / "out"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tomlkit
 
-from halbach_fe.cli import main, options
+from halbach_fe.cli import main, shared_options
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.storage import read_posterior
+from halbach_fe.inference.posterior_files import read_posterior
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.response.multipoles import UNITS
@@ -299,10 +299,10 @@ def test_bad_input(made, tmp_path, capsys, arguments, code, said):
 @pytest.mark.parametrize(("text", "orders"), [
     ("2..4", (2, 3, 4)), ("3,5,7", (3, 5, 7)), ("2..3,9,2", (2, 3, 9))])
 def test_orders(text, orders):
-    assert options.orders(text) == orders
+    assert shared_options.orders(text) == orders
 
 
 @pytest.mark.parametrize("text", ["0..3", "5..2", "2..1000", "x", "", "2..3.."])
 def test_orders_that_are_none(text):
-    with pytest.raises((ValueError, options.argparse.ArgumentTypeError)):
-        options.orders(text)
+    with pytest.raises((ValueError, shared_options.argparse.ArgumentTypeError)):
+        shared_options.orders(text)

@@ -15,13 +15,13 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import held_out_readings, observe
+from halbach_fe.measurement.observation_operator import held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.words import in_one_line
 from halbach_fe.study.free_blocks import write_free_blocks
 from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import read_study
-from halbach_fe.study.study_file import MagnetTemplate, new_study, parse_new_study
+from halbach_fe.study.writer import MagnetTemplate, new_study, parse_new_study
 from tests.cli.test_cli import refused
 from tests.conftest import ROOT
 

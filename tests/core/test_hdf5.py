@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from halbach_fe.core.untrusted import ChangedContentError, read_hdf5, with_checksum, write_hdf5
+from halbach_fe.core.untrusted_files import (
+    ChangedContentError,
+    read_hdf5,
+    with_checksum,
+    write_hdf5,
+)
 
 
 def stored() -> xr.Dataset:

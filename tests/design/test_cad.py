@@ -16,7 +16,7 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.assembly import cad
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
-from halbach_fe.report.assembly import drawing, height_mm, labels_in_words, sheets, spacers
+from halbach_fe.report.assembly_page import drawing, height_mm, labels_in_words, sheets, spacers
 from halbach_fe.report.page import rendered
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_delivery

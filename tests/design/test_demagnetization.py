@@ -20,13 +20,13 @@ from halbach_fe.design import demagnetization
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
-from halbach_fe.report.demagnetization import _layers, answer, demagnetization_summary, page
+from halbach_fe.report.demagnetization_page import _layers, answer, demagnetization_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.materials import MU_0, Demagnetization, grade
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import ROOT
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 

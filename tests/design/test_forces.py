@@ -18,9 +18,9 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_mesh import Sizes
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.forces import forces_figure, page, round_below
+from halbach_fe.report.forces_page import forces_figure, page, round_below
 from halbach_fe.report.page import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0

@@ -23,18 +23,18 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer
 from halbach_fe.magnets import magnet_of_blocks
-from halbach_fe.report import shimming, sorting
+from halbach_fe.report import shimming_page, sorting_page
 from halbach_fe.report.page import html_of, write_report
-from halbach_fe.report.tolerance import OF_THE_DESIGN
-from halbach_fe.report.tolerance import answer as answer_of_tolerance
+from halbach_fe.report.tolerance_page import OF_THE_DESIGN
+from halbach_fe.report.tolerance_page import answer as answer_of_tolerance
 from halbach_fe.response.homogeneity import homogeneity_model
 from halbach_fe.response.multipoles import MultipoleReference
 from halbach_fe.response.region import default_region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.simulate import coil_table, draw_magnet, simulate_campaign
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import changed, processor_time
 from tests.support.moved_blocks import moved
 from tests.support.pages import page
@@ -353,8 +353,8 @@ def test_shimmed_magnets_are_as_homogeneous_as_foretold(study, session, unit_fie
     assert summary["moves"][-1]["rms_after_ppm"] == found.after.rms
     # the answer has the field, not the linearized one, by which the moves were chosen
     known = replace(found.fields[1], rms_range_ppm=(123.0, 234.0, 345.0))
-    said = shimming.answer(replace(found, fields=(found.fields[0], known), limit=99.0,
-                                   within=(0.1, 0.2))).said
+    said = shimming_page.answer(replace(found, fields=(found.fields[0], known), limit=99.0,
+                                        within=(0.1, 0.2))).said
     assert "These moves do not reach that limit" in said
     assert "to 234 ppm rms (95 %: 123 to 345)" in said
 
@@ -407,8 +407,8 @@ def test_where_there_is_no_choice_a_table_of_types_is_proposed(session):
     table, _ = coil_table(alone, nominal, nominal, 0.002, np.random.default_rng(0))
     with pytest.warns(HalbachWarning, match=r"type_1 = \[1, 2, \.\.\., 8\]"):
         found = sort(build_magnet(alone), table, session)
-    assert "there is no choice" in sorting.answer(found).said
-    assert "prior.types" in sorting.answer(found).step
+    assert "there is no choice" in sorting_page.answer(found).said
+    assert "prior.types" in sorting_page.answer(found).step
 
 
 @pytest.mark.parametrize("search", ["pairs", "turns", "cycles"])

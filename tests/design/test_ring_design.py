@@ -19,12 +19,12 @@ from halbach_fe.design.ring_catalogue import designed as designed_study
 from halbach_fe.design.ring_design import Task, _best_pair, design_rings, search, task_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.page import html_of, write_report
-from halbach_fe.report.ring_design import STUDY_FILE, answer
+from halbach_fe.report.ring_design_page import STUDY_FILE, answer
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.region import Region
 from halbach_fe.solver.session import Session
-from halbach_fe.study.array import Ring
-from halbach_fe.study.design import HomogeneityRegion
+from halbach_fe.study.array_keys import Ring
+from halbach_fe.study.design_keys import HomogeneityRegion
 from halbach_fe.study.reader import parse_study, read_study
 
 REGION = Region.sphere(0.025)
@@ -316,6 +316,23 @@ def test_pages(designed, tmp_path):
     page = write_report(designed, tmp_path)
     assert "peak to peak" in page.read_text(encoding="utf-8")
     assert "<table" in html_of(designed)
+
+
+def test_rings_that_stand_elsewhere_are_designed_about_the_origin(session, tmp_path):
+    """Designed rings are about z = 0: so is the region, where the study's rings are not."""
+    there = study(array={"ring": [{"z_m": 0.1}]}, rings=4)
+    found = design_rings(there, session)
+    mean, *_ = deviations(found)
+    assert found.region.centre_m == (0.0, 0.0, 0.0)
+    # that of the magnet's middle is far from the mean in the fringe, and near in the bore
+    assert found.best.mean_T == pytest.approx(mean, rel=1e-2)
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(there.model_dump(
+        mode="json", exclude_defaults=True, exclude_none=True)), encoding="utf-8")
+    assert main(["design", str(path), "-o", str(tmp_path / "out"),
+                 "--sphere-m", "0.025"]) == 0
+    told = json.loads((tmp_path / "out/design.json").read_text(encoding="utf-8"))
+    assert told["region"]["centre_m"] == [0.0, 0.0, 0.0]
 
 
 def test_one_type_of_blocks_remains_one():

@@ -267,6 +267,21 @@ def test_a_tray_that_cannot_help_stays_empty(measured, tmp_path):
     assert found.after.rms_ppm == pytest.approx(found.before.rms_ppm)
 
 
+def test_cubes_and_bars_fill_one_tray(measured, tmp_path):
+    """The largest of both is as wide as a cube and as long as a bar, and turns as bars do."""
+    _, truth, _, posterior = measured
+    bar = {"name": "bar", "size_m": [0.004, 0.004, 0.008], "remanence_T": 1.2, "count": 8}
+    flat = bar | {"name": "flat", "size_m": [0.003, 0.006, 0.003], "angles_deg": [0, 180],
+                  "count": 40}
+    both = tray(magnets=[bar, flat], rings=[{"radius_m": 0.08, "count": 16, "z_m": [-0.09, 0.09]}])
+    found = shim_tray(build_magnet(both), Session.open(tmp_path), posterior, REGION)
+    assert {one.magnet.name for one in found.filled} == {"bar", "flat"}
+    points, _ = REGION.points(36)
+    # shims have their nominal strength here, and the update is right to 1 % of what is left
+    assert found.after.rms_ppm == pytest.approx(
+        rms_ppm(truth.getB(points) + shims(found.filled).getB(points)), rel=0.02)
+
+
 @pytest.mark.parametrize(("changes", "said"), [
     ({"rings": [{"radius_m": 0.098, "count": 8, "z_m": 0.035}]}, "place 1 .*touches block"),
     ({"rings": [{"radius_m": 0.3, "count": 8}]}, "within the magnet"),

@@ -20,16 +20,16 @@ from halbach_fe.geometry.symmetry import mountings, remounted, rotation_deg
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.shimming import answer
+from halbach_fe.report.shimming_page import answer
 from halbach_fe.report.words import faults_in_words
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import MultipoleReference, Multipoles, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.simulate import coil_table, draw_magnet, simulate_campaign, true_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed
 from tests.support.moved_blocks import moved, unturned
 

@@ -15,12 +15,12 @@ from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.magnets import halbach_ring
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.report.sorting import answer
+from halbach_fe.report.sorting_page import answer
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import coil_table, draw_magnet
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.design.test_shimming import ORDERS, RADIUS, SQUARES, chi2, study_of, true_multipoles
 
 CUBES = SQUARES | {"prior": {"types": {"a": list(range(1, 13))}, "common_mode_sd": 0.005}}

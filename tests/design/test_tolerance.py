@@ -20,8 +20,8 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import draw_magnet
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.design.test_shimming import ORDERS, RADIUS, study_of, true_multipoles
 
 PRIOR = {"magnitude_sd": 0.01, "direction_sd_deg": 0.5, "common_mode_sd": 0.005,

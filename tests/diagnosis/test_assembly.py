@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 import halbach_fe as hf
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effect_comparison import identify_effects, score_hypotheses
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.linearization import Linearization, NominalSolver, apply_effects
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import identify_effects, score_hypotheses
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import mountings, turns_in_slot
 from halbach_fe.inference.infer import infer

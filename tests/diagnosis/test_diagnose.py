@@ -13,17 +13,17 @@ import halbach_fe as hf
 from halbach_fe import explanation
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, MeasurementError
 from halbach_fe.diagnosis import diagnose as module
-from halbach_fe.diagnosis.cost import estimate_diagnosis
+from halbach_fe.diagnosis.cost_estimate import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose, dropped_with_rivals, only_equals_took_turns
+from halbach_fe.diagnosis.effect_comparison import possible
+from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Parameter, Place
 from halbach_fe.diagnosis.effects.blocks import BlocksSwappedEffect
-from halbach_fe.diagnosis.map_errors import beside_amplitudes
-from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
+from halbach_fe.diagnosis.gross_error_correction import beside_amplitudes
 from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import possible
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks

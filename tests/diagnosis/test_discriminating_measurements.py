@@ -19,10 +19,10 @@ from halbach_fe.diagnosis.discriminating_measurements import (
     present_scan,
     separations,
 )
+from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
-from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.geometry.blocks import rotation_about_z
@@ -30,10 +30,10 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import NAMES, nonlinear_part, sensor_model
+from halbach_fe.measurement.probe_law import NAMES, nonlinear_part, sensor_model
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle
 

@@ -12,7 +12,7 @@ from halbach_fe.diagnosis.map_conventions import array_variants
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
+from halbach_fe.measurement.probe_law import in_si_and_magnet_axes, nonlinear_part, sensor_model
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.routes import solve_nominal

@@ -9,11 +9,11 @@ import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_mesh import Sizes
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.study.iron import IronRing
+from halbach_fe.study.iron_keys import IronRing
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.ngsolve_reaction import Elements

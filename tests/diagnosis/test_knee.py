@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effect_comparison import with_short_steps
+from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter
 from halbach_fe.diagnosis.effects.material import COERCIVITIES, STATED, KneeEffect, _mean_losses
 from halbach_fe.diagnosis.linearization import NominalSolver
-from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.search import with_short_steps
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.reaction import _cells, lost_field, with_knee_losses
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import circle
 from tests.diagnosis.campaign import DOCUMENT, NOISE_T, drawn, field
 

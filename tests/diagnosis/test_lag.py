@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.registration import register
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import row_order_note, sensor_positions
 from halbach_fe.measurement.positions import follows_times, motion
-from halbach_fe.report.diagnosis import page as page_of_diagnosis
-from halbach_fe.report.inference import page as page_of_update
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.measurement.probe_law import row_order_note, sensor_positions
+from halbach_fe.report.diagnosis_page import page as page_of_diagnosis
+from halbach_fe.report.inference_page import page as page_of_update
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study
 from studies.diagnosis.drawn_studies import goes_both_ways
 from tests.support.short_dipole import BODY, NOISE_T, TEXT, truth

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.diagnosis import naming
-from halbach_fe.diagnosis.cost import estimate_diagnosis
+from halbach_fe.diagnosis import verdict
+from halbach_fe.diagnosis.cost_estimate import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.map_errors import (
+from halbach_fe.diagnosis.gross_error_correction import (
     MIN_MISFIT_OF_A_POSE,
     correct_map_errors,
     field_of_iron,
@@ -31,8 +31,8 @@ from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference import InstrumentSd
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import InstrumentSd
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
 
@@ -158,7 +158,7 @@ def test_a_shift_that_is_far_from_linear_is_named(generator, tmp_path, monkeypat
     (effect,) = named.identified
     assert effect.values == pytest.approx(shift, abs=4 * max(effect.sd))
     assert max(named.probabilities, key=named.probabilities.get) == "mapper_translation"
-    monkeypatch.setattr(naming, "FAR_BETTER", 0.9)
+    monkeypatch.setattr(verdict, "FAR_BETTER", 0.9)
     other = diagnose(study, data, Session.open(tmp_path), effects=some)
     assert other.unknown is not None
     assert other.unknown.alone

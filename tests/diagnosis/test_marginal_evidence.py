@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from halbach_fe.diagnosis.marginal_evidence import (
-    Marginal,
-    loo_residuals,
-    residual_groups,
-    with_fewer_columns,
-)
-from halbach_fe.diagnosis.model_selection import (
+from halbach_fe.diagnosis.effect_selection import (
     Candidate,
     best_factors,
     log_bayes_factors,
@@ -20,6 +14,12 @@ from halbach_fe.diagnosis.model_selection import (
     prior_log_odds,
     select_effects,
     with_wide_priors,
+)
+from halbach_fe.diagnosis.marginal_evidence import (
+    Marginal,
+    loo_residuals,
+    residual_groups,
+    with_fewer_columns,
 )
 
 
@@ -188,7 +188,7 @@ def test_one_large_effect_is_not_two(monkeypatch):
     """Twenty standard deviations; with the usual prior alone, a twin takes half of it."""
     (found,) = select_effects(*hidden({0: 20.0}))
     assert found.candidate.effect == "effect 0"
-    monkeypatch.setattr("halbach_fe.diagnosis.model_selection.WIDE_PRIOR_SD", 1.0)
+    monkeypatch.setattr("halbach_fe.diagnosis.effect_selection.WIDE_PRIOR_SD", 1.0)
     both = select_effects(*hidden({0: 20.0}))
     assert {one.candidate.effect for one in both} == {"effect 0", "effect 19"}
 

@@ -20,9 +20,9 @@ from halbach_fe.diagnosis.random_errors import (
     outliers_of,
     with_position_noise,
 )
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.campaign import ONLY_MAP
+from halbach_fe.measurement.campaign_maps import ONLY_MAP
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.solver.exact_block_field import gradient_of, unit_fields
 from halbach_fe.stats.gaussian import independent_noise

@@ -11,11 +11,11 @@ import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
+from halbach_fe.diagnosis.effect_selection import MAX_EFFECTS, Candidate
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
-from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
 from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import (
     IdentifiedEffect,
@@ -34,9 +34,9 @@ from halbach_fe.diagnosis.summary import (
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.diagnosis import change_table, found_table
-from halbach_fe.report.diagnosis import page as page_of_diagnosis
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.report.diagnosis_page import change_table, found_table
+from halbach_fe.report.diagnosis_page import page as page_of_diagnosis
 from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from halbach_fe.diagnosis import model_selection
-from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.marginal_evidence import Marginal
-from halbach_fe.diagnosis.model_selection import (
+from halbach_fe.diagnosis import effect_selection
+from halbach_fe.diagnosis.effect_selection import (
     FEW_PLACES,
     NOTICEABLE_CHI2,
     Candidate,
@@ -20,6 +18,8 @@ from halbach_fe.diagnosis.model_selection import (
     prior_log_odds,
     renumbered,
 )
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import unit_fields
@@ -51,8 +51,8 @@ def test_the_most_likely_are_compared(generator, monkeypatch):
         return most_likely(candidates, columns, marginal, of, in_model).numbers
 
     assert chosen(residual) == tuple(range(2 * count + 1))  # few enough for all
-    monkeypatch.setattr(model_selection, "MOST_COLUMNS", 60)
-    monkeypatch.setattr(model_selection, "AT_ONCE", 70)  # in several parts
+    monkeypatch.setattr(effect_selection, "MOST_COLUMNS", 60)
+    monkeypatch.setattr(effect_selection, "AT_ONCE", 70)  # in several parts
     found = chosen(residual, {5})
     assert {5, displaced, 2 * count} <= set(found)
     assert sum(columns[number].shape[1] for number in found) <= 60

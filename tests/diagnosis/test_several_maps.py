@@ -14,16 +14,16 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, separations
+from halbach_fe.diagnosis.effect_selection import Candidate
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis
-from halbach_fe.diagnosis.map_errors import correct_map_errors
-from halbach_fe.diagnosis.model_selection import Candidate
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.gross_error_correction import correct_map_errors
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.diagnosis.summary import diagnosis_summary, region_scores
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.campaign import read_maps
+from halbach_fe.measurement.campaign_maps import read_maps
 from halbach_fe.measurement.field_map import field_map, points_of, readings_sha256, write_map
-from halbach_fe.measurement.instrument import nonlinear_part, sensor_model, with_memory
+from halbach_fe.measurement.probe_law import nonlinear_part, sensor_model, with_memory
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session

@@ -9,7 +9,7 @@ from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis
-from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.inference.test_total_field import study_of

@@ -19,15 +19,15 @@ from halbach_fe.diagnosis.summary import STUDY_FILE
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.inference.posterior_files import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.report.inference import STUDY_FILE as UPDATED
 from halbach_fe.report.inference_answer import answer as inference_answer
+from halbach_fe.report.inference_page import STUDY_FILE as UPDATED
 from halbach_fe.response.block_variation import shared_deviations
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.inference import number_changes, shifted
+from halbach_fe.study.inference_keys import number_changes, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import circle

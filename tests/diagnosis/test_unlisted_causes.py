@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis import diagnose as module
-from halbach_fe.diagnosis.competition import Competition, Explanation
+from halbach_fe.diagnosis.competing_causes import Competition, Explanation
 from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effect_comparison import possible
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
 from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.marginal_evidence import Evidence
-from halbach_fe.diagnosis.naming import are_scattered, kind_of
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.search import possible
+from halbach_fe.diagnosis.verdict import are_scattered, kind_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer

@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.formats.grid import grid_of
+from halbach_fe.measurement.formats.grid_formats import grid_of
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from tests.fuzz.contract import BrokenError, refusal
 from tests.fuzz.readers import by_name, edge_elements

@@ -21,7 +21,7 @@ import meshio
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.errors import (
     GetDPError,
     HalbachWarning,
@@ -32,26 +32,26 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference import mcmc, storage
+from halbach_fe.inference import mcmc, posterior_files
 from halbach_fe.inference.mcmc import _Run
-from halbach_fe.inference.storage import _stored_root, read_posterior
+from halbach_fe.inference.posterior_files import _stored_root, read_posterior
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, read_order, write_blocks
 from halbach_fe.measurement.field_map import checked_readings, field_map, read_map, write_map
-from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import READERS as FORMATS
-from halbach_fe.measurement.formats.files import import_map
-from halbach_fe.measurement.formats.grid import grid_of
+from halbach_fe.measurement.formats.block_tables import DeclaredBlocks, import_blocks
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.grid_formats import grid_of
+from halbach_fe.measurement.formats.import_export import READERS as FORMATS
+from halbach_fe.measurement.formats.import_export import import_map
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from halbach_fe.measurement.map_join import MapPose, read_joined
-from halbach_fe.report.campaign_report import read_campaign
+from halbach_fe.report.joint_report import read_campaign
 from halbach_fe.response import matrix as matrix_module
 from halbach_fe.response.matrix import Response, StoredMatrix, _beside
 from halbach_fe.response.matrix import _read as read_response
 from halbach_fe.response.matrix import _write as write_response
-from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
 from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
+from halbach_fe.solver.getdp_files import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session, newton_residuals
@@ -65,7 +65,7 @@ from halbach_fe.study.free_blocks import (
 )
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import _with_table, parse_study, read_study
-from halbach_fe.study.study_file import edited_text
+from halbach_fe.study.writer import edited_text
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import FREE, RICH, document
@@ -81,7 +81,7 @@ from tests.measurement.test_import_map import (
     comsol_sections,
     rows,
 )
-from tests.solver.test_dofs import ROWS, SOLUTIONS, matrix, saved, vectors
+from tests.solver.test_getdp_files import ROWS, SOLUTIONS, matrix, saved, vectors
 from tests.support.results import results
 
 TINY = parse_study(changed(
@@ -194,7 +194,7 @@ def a_response() -> bytes:
 def unverified(module: ModuleType, read: Callable[[Path], Any]) -> Callable[[Path], Any]:
     """A reader that takes every checksum for right: who makes a hostile file can compute it."""
     def reading(path: Path) -> Any:
-        with mock.patch.object(module, "read_hdf5", untrusted.read_dataset):
+        with mock.patch.object(module, "read_hdf5", untrusted_files.read_dataset):
             return read(path)
     return reading
 
@@ -596,7 +596,7 @@ def readers() -> tuple[Reader, ...]:
                   seeds=(columns[0], (OPERA + rows(field=FIELD)).encode(), sheet, grid))
           for name in FORMATS),
         Reader("posterior", "posterior.h5", (posterior(),),
-               unverified(storage, lambda path: read_posterior(build_magnet(TINY), path)),
+               unverified(posterior_files, lambda path: read_posterior(build_magnet(TINY), path)),
                MeasurementError,
                check_posterior, HDF5),
         Reader("stored response", "response.h5", (a_response(),),

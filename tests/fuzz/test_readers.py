@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import GetDPError, MeasurementError
-from halbach_fe.measurement.formats.files import READERS as FORMATS
+from halbach_fe.measurement.formats.import_export import READERS as FORMATS
 from tests.fuzz import contract
 from tests.fuzz.contract import BrokenError, Reader, refusal
 from tests.fuzz.mutation import made

@@ -19,12 +19,12 @@ import tomlkit
 from scipy.spatial import KDTree
 
 from halbach_fe.core.errors import HalbachWarning, MeshError, StudyError
-from halbach_fe.geo.iron_bodies import _volume, check_apart
-from halbach_fe.geo.session import gmsh_session
+from halbach_fe.geo.gmsh_session import gmsh_session
+from halbach_fe.geo.iron_mesh import _volume, check_apart
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.iron import _slit
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.iron import closed_surface
+from halbach_fe.study.iron_keys import closed_surface
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, changed, processor_time
 

@@ -9,7 +9,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.solver.exact_block_field import external_field, field_of, neighbour_field
 from halbach_fe.solver.routes import check_points
-from halbach_fe.study.external import Neighbour
+from halbach_fe.study.external_keys import Neighbour
 from tests.conftest import circle
 
 

@@ -13,10 +13,10 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.outline import outline_contains, ring_radii
 from halbach_fe.geometry.surface import ON_SURFACE
-from halbach_fe.inference.readings import read_campaign
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.inference.campaign_readings import read_campaign
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.solution import answer
+from halbach_fe.report.solution_page import answer
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.solution import solve, study_observation
 from halbach_fe.solver.exact_block_field import field_of, gradient_of

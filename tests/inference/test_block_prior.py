@@ -30,8 +30,8 @@ from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, shared_doubts
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.report.page import write_files
-from halbach_fe.report.prior import answer, page
-from halbach_fe.report.tolerance import answer as tolerance_answer
+from halbach_fe.report.prior_page import answer, page
+from halbach_fe.report.tolerance_page import answer as tolerance_answer
 from halbach_fe.response.block_variation import study_prior
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.solver.ring_harmonics_2d import (
@@ -46,7 +46,7 @@ from halbach_fe.stats.gaussian import (
     shrunk_covariance,
 )
 from halbach_fe.study.materials import MU_0, grade
-from halbach_fe.synthetic import bodies
+from halbach_fe.synthetic import true_magnet_of_study
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from tests.oracles.cuboids import aharoni
 from tests.oracles.lone_block import moment_matrix
@@ -203,7 +203,7 @@ def test_conversion_of_a_lone_block(short_dipole, along, across, error):
     remanence = np.array([1.06, 0.03, 0.02])
     permeability = (along, across, across)
     with ngsolve.TaskManager():
-        moment = moment_matrix(bodies.SectorBody(0.104, 0.1865, np.pi / 16, 0.08),
+        moment = moment_matrix(true_magnet_of_study.SectorBody(0.104, 0.1865, np.pi / 16, 0.08),
                                np.diag(permeability)) @ remanence
     # the same block in all places, as seen from its own axes only in the first
     slots, rings, others = blocks_and_truth(study, np.random.default_rng(0))
@@ -311,7 +311,7 @@ def test_a_doubted_table_is_no_prior_without_a_word(vacuum_dipole, generator, fa
     magnet = build_magnet(study)
     slots, rings, truth = blocks_and_truth(study, generator, spread=0.002)
     points = generator.uniform(-0.04, 0.04, (30, 3))
-    nominal = vacuum_field(bodies.magnet_of(study).bodies, points)
+    nominal = vacuum_field(true_magnet_of_study.magnet_of(study).bodies, points)
     table = table_of(study, slots, factor * truth, rings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HalbachWarning)

@@ -20,18 +20,18 @@ from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import infer as infer_module
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.posterior_files import inference_summary
 from halbach_fe.inference.registration import contradictions
-from halbach_fe.inference.storage import inference_summary
-from halbach_fe.measurement.campaign import maps_of, read_maps
+from halbach_fe.measurement.campaign_maps import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.map_join import MapPose
-from halbach_fe.measurement.observation import concatenate, observe
+from halbach_fe.measurement.observation_operator import concatenate, observe
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.response.block_variation import Deviations
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import (
     BODY,

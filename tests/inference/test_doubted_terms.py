@@ -18,18 +18,18 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.api import diagnose, multipoles
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.progress import Pace
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_result import ProbePrior
 from halbach_fe.inference.pose_search import coarse_poses
+from halbach_fe.inference.posterior_files import read_posterior, write_inference
 from halbach_fe.inference.registration import (
     axes_of_map,
     nearest_right_angles,
     register,
     turn_from_axes,
 )
-from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.magnets import to_magpylib
 from halbach_fe.measurement.doubted_terms import (
     ALL_AXES,
@@ -54,12 +54,12 @@ from halbach_fe.measurement.field_map import (
     undirected,
     write_map,
 )
-from halbach_fe.measurement.instrument import NAMES, in_si_and_magnet_axes
 from halbach_fe.measurement.map_check import check_map
+from halbach_fe.measurement.probe_law import NAMES, in_si_and_magnet_axes
 from halbach_fe.report.diagnosis_answer import answer as diagnosis_answer
 from halbach_fe.report.inference_answer import answer as inference_answer
-from halbach_fe.report.multipoles import answer as multipoles_answer
-from halbach_fe.report.registration import (
+from halbach_fe.report.multipoles_page import answer as multipoles_answer
+from halbach_fe.report.registration_page import (
     AT_REST,
     DOUBTED,
     USE_ANY,
@@ -69,8 +69,8 @@ from halbach_fe.report.registration import (
     rivals,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference import InstrumentSd
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.inference_keys import InstrumentSd
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.support import cube_dipole
 from tests.support.cube_dipole import GRID, TEXT, component, noisier

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.campaign_readings import check_validation_map, read_campaign
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.readings import check_validation_map, read_campaign
 from halbach_fe.inference.result import HELD_OUT_MAP
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle

@@ -17,10 +17,10 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import _check_linearization, infer
+from halbach_fe.inference.posterior_files import write_inference
 from halbach_fe.inference.result import TOO_NEAR
-from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.report.point_maps import main_line
 from halbach_fe.response.block_variation import with_magnetizations
 from halbach_fe.response.matrix import response_matrix
@@ -33,7 +33,7 @@ from halbach_fe.solver.ring_harmonics_2d import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import circle
@@ -183,7 +183,7 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     low, high = 100 * update.contraction.min(), 100 * update.contraction.max()
     share = f"{low:.0f} to {high:.0f}" if f"{low:.0f}" != f"{high:.0f}" else f"{low:.0f}"
     assert f"by {share}\u00a0% of the prior's variance" in text.replace("&#39;", "'")
-    monkeypatch.setattr("halbach_fe.report.inference.ALIKE", -1.0)
+    monkeypatch.setattr("halbach_fe.report.inference_page.ALIKE", -1.0)
     write_result(update, tmp_path)
     assert page(tmp_path / "report.html").count("<img alt=") == 6
 

@@ -16,7 +16,7 @@ from halbach_fe.inference.pose_result import OpenKey, PosePrior
 from halbach_fe.inference.pose_search import line_of
 from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.report.registration import answer, by_hypothesis, sentences
+from halbach_fe.report.registration_page import answer, by_hypothesis, sentences
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import TEXT as CIRCLES

@@ -15,8 +15,8 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR, not_carried
 from halbach_fe.magnets import halbach_ring, to_magpylib
 from halbach_fe.measurement.field_map import field_map, total_field_map
-from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
-from halbach_fe.report.homogeneity import answer
+from halbach_fe.measurement.source_free_field import solid_harmonic_fields
+from halbach_fe.report.homogeneity_page import answer
 from halbach_fe.report.page import write_report
 from halbach_fe.response.homogeneity import Homogeneity, real_harmonics
 from halbach_fe.response.region import Region, region_points, sphere_points

@@ -30,8 +30,8 @@ from halbach_fe.inference.mcmc import (
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import circle
 from tests.oracles import ngsolve_nonlinear
 

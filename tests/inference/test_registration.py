@@ -33,8 +33,8 @@ from halbach_fe.inference.registration import (
 )
 from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.measurement.instrument import NAMES
-from halbach_fe.report.registration import (
+from halbach_fe.measurement.probe_law import NAMES
+from halbach_fe.report.registration_page import (
     AT_REST,
     NOT_AT_REST,
     UNDECIDED,
@@ -49,9 +49,9 @@ from halbach_fe.report.registration import (
     stated_odds,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference import InstrumentSd
+from halbach_fe.study.inference_keys import InstrumentSd
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
 

@@ -10,8 +10,8 @@ import pytest
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.readings import read_campaign
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.inference.campaign_readings import read_campaign
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.study.reader import parse_study
 

@@ -13,9 +13,9 @@ from scipy import stats
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.inference.posterior_files import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import matrix as response_module
 from halbach_fe.response.matrix import StoredMatrix, response_matrix

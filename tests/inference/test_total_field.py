@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.campaign_readings import read_campaign
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_fit import PoseFit
-from halbach_fe.inference.readings import read_campaign
+from halbach_fe.inference.posterior_files import write_inference
 from halbach_fe.inference.registration import register
-from halbach_fe.inference.storage import write_inference
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
 from halbach_fe.report.inference_answer import answer
-from halbach_fe.report.registration import sentences
+from halbach_fe.report.registration_page import sentences
 from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import StoredMatrix
 from halbach_fe.solver.session import Session

@@ -16,8 +16,8 @@ import halbach_fe as hf
 from halbach_fe.diagnosis.summary import main_field_T
 from halbach_fe.geometry.magnet import build_magnet, neighbour_blocks
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.posterior_files import inference_summary, read_posterior, write_inference
 from halbach_fe.inference.result import PREDICTION_COLUMNS
-from halbach_fe.inference.storage import inference_summary, read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.response.multipoles import circle_models

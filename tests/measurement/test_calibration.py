@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import field_map, read_map
-from halbach_fe.measurement.formats.files import HEADER, read_calibration
+from halbach_fe.measurement.formats.import_export import HEADER, read_calibration
 
 ERRORS = {"x": [0.3, -0.1, 0.2], "y": [0.0, 0.05, -0.4], "z": [0.1, 0.1, 0.1]}
 FIELDS = [-1.5, 0.0, 1.5]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.measurement.field_map import field_map, points_of, read_map
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import WRITERS, export_map, import_map
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import WRITERS, export_map, import_map
 from tests.measurement.test_import_map import FIELD, POINTS
 
 with warnings.catch_warnings():  # its plots use what matplotlib will drop

@@ -13,7 +13,7 @@ from halbach_fe.api import export
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
-from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
     checked_map,
@@ -200,7 +200,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("halbach_fe.measurement.tables._cell", full)
+    monkeypatch.setattr("halbach_fe.measurement.text_tables._cell", full)
     with pytest.raises(OutputError, match="No space left"):
         write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
     assert path.read_bytes() == before

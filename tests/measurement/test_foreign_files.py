@@ -12,9 +12,9 @@ import pytest
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import field_map, points_of, write_map
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import import_map
-from halbach_fe.measurement.tables import undecorated
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import import_map
+from halbach_fe.measurement.text_tables import undecorated
 from tests.conftest import processor_time
 from tests.measurement.foreign_files import (
     FIELD,

@@ -12,9 +12,9 @@ import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
-from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import import_map
+from halbach_fe.measurement.formats.block_tables import DeclaredBlocks, import_blocks
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import import_map
 from halbach_fe.study.free_blocks import FreeBlocks, read_free_blocks
 
 MU_0 = 4e-7 * np.pi

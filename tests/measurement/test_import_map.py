@@ -19,8 +19,8 @@ from halbach_fe.measurement.field_map import (
     read_map,
     write_map,
 )
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import export_map, format_of, import_map
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import export_map, format_of, import_map
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
 from tests.conftest import ROOT
 

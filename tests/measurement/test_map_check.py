@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe import explanation
 from halbach_fe.cli import main
-from halbach_fe.cli.measured import floor_of
+from halbach_fe.cli.measurement_verbs import floor_of
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
-from halbach_fe.core.pace import quiet
-from halbach_fe.measurement import harmonic_field, map_check
+from halbach_fe.core.progress import quiet
+from halbach_fe.measurement import map_check, source_free_field
 from halbach_fe.measurement.field_map import (
     checked_map,
     field_map,
@@ -27,16 +27,16 @@ from halbach_fe.measurement.field_map import (
     readings_sha256,
     write_map,
 )
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import export_map, import_map
-from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
-from halbach_fe.measurement.instrument import map_time, remove_nonlinear_part
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import export_map, import_map
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.positions import held_out_lines, is_sorted, motion
-from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
+from halbach_fe.measurement.probe_fit import ProbeModel, noise_of, scatter_of
+from halbach_fe.measurement.probe_law import map_time, remove_nonlinear_part
+from halbach_fe.measurement.source_free_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.suspect_rows import broken_rows, neighbours, rough_rows, stands_out
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.map_check import (
+from halbach_fe.report.map_check_page import (
     OPEN_SIGN,
     answer,
     doubt_of_times,
@@ -49,7 +49,7 @@ from halbach_fe.report.map_check import (
 )
 from halbach_fe.report.page import write_report
 from halbach_fe.solver.session import NOT_KEPT
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 from tests.support.short_dipole import FRINGE, sectors, truth
 
@@ -102,7 +102,7 @@ def test_charges_make_any_field_in_free_space(generator):
 
 def test_noise_that_a_fit_leaves(generator, monkeypatch):
     """Beside the whole matrix, and beside drawn noise; the control is the same share everywhere."""
-    monkeypatch.setattr(harmonic_field, "AT_ONCE", 100)
+    monkeypatch.setattr(source_free_field, "AT_ONCE", 100)
     points = GRID[::3]
     field = read_by(generator)[::3]
     charges = Charges.around(points, 2.5 * STEP_M)
@@ -128,7 +128,7 @@ def test_the_penalty_of_largest_evidence_is_found_beside_another_maximum():
     scan, _, _ = map_check.scan_of(hard_map(1))
     charges = Charges.around(scan.points, 1.5 * map_check.point_spacing(scan.points))
     model, rows = scan.model(charges), np.ones(len(scan.points), bool)
-    at = model.start(harmonic_field.NO_FIT)
+    at = model.start(source_free_field.NO_FIT)
     readings, free = model.target(at, rows), model.free(at, rows, 0.0)
     fit = free.most_probable(readings)
 
@@ -138,11 +138,11 @@ def test_the_penalty_of_largest_evidence_is_found_beside_another_maximum():
         sigma = np.sqrt(readings @ np.linalg.solve(whole, readings) / len(readings))
         return -len(readings) * np.log(sigma) - np.linalg.slogdet(whole)[1] / 2
 
-    every = [evidence(penalty) for penalty in harmonic_field.PENALTIES * free.mean]
+    every = [evidence(penalty) for penalty in source_free_field.PENALTIES * free.mean]
     # the smallest penalty is that of rounding, which left 0.6 of one evidence
     assert abs(fit.log_evidence - max(every)) < 2
     assert fit.penalty == pytest.approx(
-        harmonic_field.PENALTIES[int(np.argmax(every))] * free.mean)
+        source_free_field.PENALTIES[int(np.argmax(every))] * free.mean)
     peaks = [one for low, one, high in zip(
         [-np.inf, *every], every, [*every[1:], -np.inf], strict=False) if one > max(low, high)]
     # the control: whoever climbs from the wrong side finds another one
@@ -165,15 +165,15 @@ def test_evidence_is_that_of_singular_values_whatever_the_size(
     left, values, _ = np.linalg.svd(design, full_matrices=False)
     along = left.T @ readings
     beyond = readings - left @ along
-    free = harmonic_field.FreeField(design, 0.0)
+    free = source_free_field.FreeField(design, 0.0)
     every = []
-    for penalty in np.maximum(harmonic_field.PENALTIES * free.mean, free.least):
+    for penalty in np.maximum(source_free_field.PENALTIES * free.mean, free.least):
         share = penalty / (values**2 + penalty)
         every.append(np.log(share).sum() / 2 - len(readings) * np.log(
             (beyond @ beyond + share @ along**2) / len(readings)) / 2)
     for few in (10_000, 10):
-        monkeypatch.setattr(harmonic_field, "FEW", few)
-        free = harmonic_field.FreeField(design, 0.0)
+        monkeypatch.setattr(source_free_field, "FEW", few)
+        free = source_free_field.FreeField(design, 0.0)
         assert free.most_probable(readings).log_evidence == pytest.approx(max(every), abs=0.3)
         _, vectors = free.spectrum
         assert np.abs(vectors.T @ vectors - np.eye(vectors.shape[1])).max() < 1e-10
@@ -183,13 +183,13 @@ def test_few_combinations_of_charges_have_the_field_of_all(generator):
     """Of what readings determine; the control leaves out what they do."""
     field = read_by(generator)
     charges = Charges.around(GRID, 2.5 * STEP_M)
-    free = harmonic_field.FreeField(charges.fields(GRID).reshape(-1, len(charges)), 0.0)
+    free = source_free_field.FreeField(charges.fields(GRID).reshape(-1, len(charges)), 0.0)
     best = free.most_probable(field.ravel())
     whole = charges.field(GRID, best.amplitudes)
     for penalty, like in ((best.penalty, True), (1e6 * best.penalty, False)):
         chosen, vectors = free.determined(penalty)
-        few = harmonic_field.FewCharges(charges.places[chosen[:-3]], charges.scale, vectors)
-        own = harmonic_field.FreeField(few.fields(GRID).reshape(-1, len(few)), best.penalty)
+        few = source_free_field.FewCharges(charges.places[chosen[:-3]], charges.scale, vectors)
+        own = source_free_field.FreeField(few.fields(GRID).reshape(-1, len(few)), best.penalty)
         off = few.field(GRID, own.amplitudes(field.ravel())) - whole
         assert len(few) < len(charges)
         # what is left out was fitted to 1 % of the noise at most
@@ -696,7 +696,7 @@ def test_the_corrected_map_is_that_of_an_ideal_probe(generator):
 
 
 def test_a_study_holds_out_the_lines_that_the_check_does(generator):
-    from halbach_fe.measurement.observation import held_out_readings, observe
+    from halbach_fe.measurement.observation_operator import held_out_readings, observe
     from halbach_fe.study.reader import parse_study
 
     keys = {"name": "lines", "array": {
@@ -828,7 +828,7 @@ def test_a_place_that_is_read_twice(generator):
     points = np.vstack(2 * [GRID[::4]])
     field = 1e-3 * points + 1e-5 * generator.standard_normal(points.shape)
     charges = Charges.around(points, 1.5 * STEP_M)
-    free = harmonic_field.FreeField(charges.fields(points).reshape(3 * len(points), -1), 0.0)
+    free = source_free_field.FreeField(charges.fields(points).reshape(3 * len(points), -1), 0.0)
     assert free.dual
     assert np.isfinite(free.most_probable(field.ravel()).amplitudes).all()
     with pytest.raises(np.linalg.LinAlgError):  # the control: a penalty below rounding

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.progress import Pace
 from halbach_fe.measurement import map_join
-from halbach_fe.measurement.campaign import refuse_shared
+from halbach_fe.measurement.campaign_maps import refuse_shared
 from halbach_fe.measurement.field_map import (
     field_map,
     points_of,
@@ -24,13 +24,13 @@ from halbach_fe.measurement.field_map import (
     readings_sha256,
     write_map,
 )
-from halbach_fe.measurement.harmonic_field import Charges
-from halbach_fe.measurement.joined_probe import TERMS, JoinedModel, Pose
 from halbach_fe.measurement.map_check import InstrumentTerm, check_map, scan_of
 from halbach_fe.measurement.map_join import join_checked, join_maps, read_joined
-from halbach_fe.measurement.probe_in_field import LAG
-from halbach_fe.report.map_check import joined_answer as answer
-from halbach_fe.report.map_check import joined_sentences as sentences
+from halbach_fe.measurement.map_join_fit import TERMS, JoinedModel, Pose
+from halbach_fe.measurement.probe_fit import LAG
+from halbach_fe.measurement.source_free_field import Charges
+from halbach_fe.report.map_check_page import joined_answer as answer
+from halbach_fe.report.map_check_page import joined_sentences as sentences
 from tests.support.joined_campaigns import (
     MAGNETS,
     NOISE_T,

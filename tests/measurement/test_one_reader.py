@@ -10,8 +10,8 @@ import xarray as xr
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import export_map, import_map
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import export_map, import_map
 
 POINTS = np.array([[0.0, 0.0, 0.01 * n] for n in range(6)])
 FIELD = np.random.default_rng(3).normal(0.1, 0.01, (6, 3))

@@ -11,7 +11,7 @@ import pytest
 from halbach_fe.measurement import map_check
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.map_check import check_map
-from halbach_fe.report.map_check import STRETCHED, answer, sentences
+from halbach_fe.report.map_check_page import STRETCHED, answer, sentences
 from tests.support import cube_dipole
 from tests.support.hard_maps import quadrupole, serpentine
 from tests.support.short_dipole import truth

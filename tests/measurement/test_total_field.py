@@ -24,12 +24,12 @@ from halbach_fe.measurement.field_map import (
     with_total_field,
     write_map,
 )
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import export_map, import_map
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import export_map, import_map
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.suspect_rows import check_total, contradicted_rows
-from halbach_fe.report.map_check import total_answer
+from halbach_fe.report.map_check_page import total_answer
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.measurement.test_map_check import GRID, source

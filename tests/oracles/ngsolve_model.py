@@ -13,8 +13,8 @@ import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 
-from halbach_fe.synthetic.bodies import SectorBody
 from halbach_fe.synthetic.ngsolve_reaction import outline_face
+from halbach_fe.synthetic.true_magnet_of_study import SectorBody
 
 
 @dataclass(frozen=True)

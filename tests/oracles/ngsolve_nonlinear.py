@@ -8,9 +8,9 @@ import ngsolve as ngs
 import numpy as np
 
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.bodies import TrueMagnet
 from halbach_fe.synthetic.ngsolve_reaction import half_field, newton, permeability
 from halbach_fe.synthetic.true_magnet import FroehlichLaw
+from halbach_fe.synthetic.true_magnet_of_study import TrueMagnet
 from tests.oracles.ngsolve_model import Dipole, even_field
 
 

@@ -26,24 +26,24 @@ from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.summary import amounts
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.posterior_files import read_posterior, write_inference
 from halbach_fe.inference.result import OWN_NOISE
-from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.report import (
-    campaign,
-    demagnetization,
+    demagnetization_page,
     diagnosis_figures,
-    field,
-    forces,
-    homogeneity,
+    field_page,
+    forces_page,
+    homogeneity_page,
     inference_answer,
-    multipoles,
-    plan,
-    prior,
-    shimming,
-    solution,
-    sorting,
-    tolerance,
-    verification,
+    multipoles_page,
+    plan_page,
+    prior_page,
+    shimming_page,
+    simulated_campaign_page,
+    solution_page,
+    sorting_page,
+    tolerance_page,
+    verification_page,
 )
 from halbach_fe.report.answer import LISTED_MAPS, MOST_WORDS, Answer, known_paths, of_a_conflict
 from halbach_fe.report.page import write_files
@@ -105,7 +105,7 @@ def given(tmp_path_factory):
 def of_solve(given):
     found = hf.solve(given.magnet, given.session)
     size = np.linalg.norm(found.flux_density, axis=1)
-    return solution.answer(found), [flux_density(size.max(), 4), "exact", "homogeneity STUDY"]
+    return solution_page.answer(found), [flux_density(size.max(), 4), "exact", "homogeneity STUDY"]
 
 
 def test_the_field_in_the_middle_is_said_first(given):
@@ -123,17 +123,17 @@ def test_the_field_in_the_middle_is_said_first(given):
         radial = (found.flux_density[on_circle, :2] * np.column_stack(
             [np.cos(angle), np.sin(angle)])).sum(axis=1)
         size = 2 * abs(np.mean(radial * np.exp(-1j * order * angle)))
-        said = solution.page(found).answer.said
+        said = solution_page.page(found).answer.said
         assert re.match("On the circle r = 30\u00a0mm at z = 0\u00a0mm the "
                         f"{name} is ([0-9.]+)\u00a0{unit}", said)
         value = float(re.search("is ([0-9.]+)", said)[1])
         assert value == pytest.approx(size / scale, rel=ALIASES)
-    assert "On the circle" not in solution.answer(found).said
+    assert "On the circle" not in solution_page.answer(found).said
     rounded = given.study.observation.positions.model_copy(update={
         "z_min_m": -0.055, "z_max_m": 0.055, "count": 21})  # the 11th at -7e-18 m
     found = hf.solve(build_magnet(given.study.with_(
         observation__positions=rounded.model_dump())), given.session)
-    assert "at z = 0\u00a0mm" in solution.page(found).answer.said
+    assert "at z = 0\u00a0mm" in solution_page.page(found).answer.said
 
 
 def test_blocks_that_are_not_as_designed_are_named(given):
@@ -173,19 +173,19 @@ def test_blocks_that_are_not_as_designed_are_named(given):
 
 def of_verify(given):
     found = hf.verify(given.magnet, given.session)
-    return verification.answer(found), [flux_density(found.main_field_T, 4), "exact"]
+    return verification_page.answer(found), [flux_density(found.main_field_T, 4), "exact"]
 
 
 def test_a_field_beside_iron_is_never_called_a_closed_form(given):
     """A sphere 5 m away changes it by less than the computer rounds: pages said there was none."""
     beside = given.magnet.with_(iron={"relative_permeability": 1000.0, "bodies": [
         {"kind": "sphere", "radius_m": 0.005, "centre_m": [5.0, 0.0, 0.0]}]})
-    for found, answer in ((hf.solve(given.magnet, given.session), solution.answer),
-                          (hf.verify(given.magnet, given.session), verification.answer)):
+    for found, answer in ((hf.solve(given.magnet, given.session), solution_page.answer),
+                          (hf.verify(given.magnet, given.session), verification_page.answer)):
         for magnet, is_exact in ((given.magnet, True), (beside, False)):
             said = answer(replace(found, magnet=magnet))
             assert ("exact" in said.said + said.trust) == is_exact
-    assert verification.difference_table(replace(found, magnet=beside))
+    assert verification_page.difference_table(replace(found, magnet=beside))
 
 
 def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
@@ -196,11 +196,11 @@ def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
             observation__quantity=quantity, mesh__block_size_m=0.04, **settings))
         solved, verified = hf.solve(magnet, session), hf.verify(magnet, session)
         coefficient = quantity == "fourier_coefficients"
-        said = solution.answer(solved).said
+        said = solution_page.answer(solved).said
         assert ("a Fourier coefficient of B_r" in said) == coefficient
         assert ("a component of B" in said) != coefficient
         assert flux_density(solved.errors.max()) in said
-        said = verification.answer(verified).said
+        said = verification_page.answer(verified).said
         off = flux_density(verified.error_pointwise * verified.main_field_T)
         assert f"the vector B is off by {off}" in said
         own = flux_density(verified.error_fourier * verified.main_field_T)
@@ -211,7 +211,8 @@ def test_the_mean_of_a_multipole_is_zero_and_that_of_its_size_is_not(session):
     """A quadrupole of twelve sectors: on its circle B turns twice."""
     study = parse_study(changed(DIPOLE, array__multipole_order=2, array__recoil_permeability=1.0,
                                 array__blocks_per_ring=12))
-    rows = {row["B"]: row for row in solution.field_table(hf.solve(build_magnet(study), session))}
+    rows = {row["B"]: row for row in solution_page.field_table(
+        hf.solve(build_magnet(study), session))}
     assert rows["mean of the vector B"]["|B|"] == "0\u00a0mT"
     assert float(rows["mean of |B|"]["|B|"].split()[0]) > 100
     assert rows["mean of |B|"]["Bx"] == ""
@@ -222,16 +223,16 @@ def test_a_field_that_cancels_has_no_direction(given):
     four = parse_study(changed(MAGNET, array__multipole_order=2))
     for study, cancels in ((four, True), (given.study, False)):
         found = hf.homogeneity(build_magnet(study), given.session, degrees=2)
-        row, = homogeneity.homogeneity_rows(found.by_name)
+        row, = homogeneity_page.homogeneity_rows(found.by_name)
         assert (row["direction of the mean B"] == "none: it cancels") == cancels
         assert float(row["mean of |B|"].split("\u00a0")[0]) > 1
-        said = homogeneity.answer(found)
+        said = homogeneity_page.answer(found)
         assert said.trust.startswith("Only" if cancels else "Yes")
         assert ("multipoles" in said.command) == cancels
         if cancels:  # of a study of a dipole, whose multipoles would be refused
-            other = homogeneity.answer(replace(found, magnet=given.magnet))
+            other = homogeneity_page.answer(replace(found, magnet=given.magnet))
             assert other.command.startswith("halbach-fe field STUDY --from-m 0 0 -")
-        assert bool(homogeneity.harmonic_rows(found)) != cancels
+        assert bool(homogeneity_page.harmonic_rows(found)) != cancels
 
 
 @pytest.mark.parametrize(("mean", "root"), [  # b_n and a_n in units; columns are independent
@@ -243,7 +244,7 @@ def test_error_of_a_multipoles_size(mean, root):
     known = Multipoles((3,), 1.0, 0.0, 0.0, 0.0, np.array(mean, float), np.array(root, float),
                           np.zeros(2), np.array(root, float))
     drawn = known.sizes_of(np.random.default_rng(1).standard_normal((20_000, 2)))
-    spread, = multipoles._size_sd(known)
+    spread, = multipoles_page._size_sd(known)
     # where the mean is 0 the rms of a part is stated, 1.5 times the sd of a Rayleigh distribution
     assert 0.85 < spread / np.std(drawn) < 1.6
 
@@ -252,9 +253,9 @@ def of_multipoles(given):
     tables = hf.multipoles(given.magnet, given.session).tables
     known = [magnets["prior"] for _, magnets in tables]
     # the largest one that the answer states is in the table
-    largest = [max(multipoles.multipole_rows(magnets), key=lambda row: float(
+    largest = [max(multipoles_page.multipole_rows(magnets), key=lambda row: float(
         row["|c_n| prior"].split("\u00a0")[0]))["|c_n| prior"] for _, magnets in tables]
-    return multipoles.answer(tables, 50.0), [
+    return multipoles_page.answer(tables, 50.0), [
         *(f"{size} units" for size in largest),
         *(with_error(1e3 * one.main, 1e3 * one.main_sd) for one in known), "within 50 units",
         "as ordered"]
@@ -271,23 +272,23 @@ def test_what_was_asked_on_a_circle_is_advised_there(given, tmp_path):
     magnet, campaign = build_magnet(study), simulate_campaign(study, 3)
     updated = hf.infer(magnet, campaign.readings, given.session)
     option = " --at-z-m 0.015 "
-    said = [multipoles.page(hf.multipoles(magnet, given.session, there, updated)).answer,
-            tolerance.answer(hf.tolerance(magnet, given.session, None, there, draws=100)),
-            sorting.answer(replace(hf.sort(magnet, campaign.blocks, given.session, there),
-                                   doubts=("Is it?",)))]
+    said = [multipoles_page.page(hf.multipoles(magnet, given.session, there, updated)).answer,
+            tolerance_page.answer(hf.tolerance(magnet, given.session, None, there, draws=100)),
+            sorting_page.answer(replace(hf.sort(magnet, campaign.blocks, given.session, there),
+                                        doubts=("Is it?",)))]
     assert [option in one.command for one in said] == [True, True, True]
     with pytest.raises(StudyError, match="--at-z-m Z"):
         hf.shim(updated, given.session)
     assert hf.shim(updated, given.session, there, swaps=1, turns=0).tried
-    plain = [multipoles.page(hf.multipoles(given.magnet, given.session, None, given.updated)),
-             tolerance.page(hf.tolerance(given.magnet, given.session, draws=100))]
+    plain = [multipoles_page.page(hf.multipoles(given.magnet, given.session, None, given.updated)),
+             tolerance_page.page(hf.tolerance(given.magnet, given.session, draws=100))]
     assert not any("--at-z-m" in one.answer.command for one in plain)
 
 
 def of_homogeneity(given):
     found = hf.homogeneity(given.magnet, given.session, degrees=2)
     known = found.by_name["prior"]
-    return homogeneity.answer(found), [f"{ppm(known.rms_ppm)} ppm rms", "exact", "as ordered"]
+    return homogeneity_page.answer(found), [f"{ppm(known.rms_ppm)} ppm rms", "exact", "as ordered"]
 
 
 @pytest.mark.parametrize("free", [True, False])
@@ -303,7 +304,7 @@ def test_only_rings_are_sent_to_the_design_of_rings(tmp_path, session, free):
     study = tmp_path / "study.toml"
     study.write_text(tomlkit.dumps(document))
     magnet = build_magnet(hf.read_study(study))
-    said = homogeneity.answer(hf.homogeneity(magnet, session, Region.sphere(0.01), degrees=2))
+    said = homogeneity_page.answer(hf.homogeneity(magnet, session, Region.sphere(0.01), degrees=2))
     assert ("design" in said.command) != free
     if free:
         words = shlex.split(said.command.replace("STUDY", str(study)).replace(
@@ -313,8 +314,9 @@ def test_only_rings_are_sent_to_the_design_of_rings(tmp_path, session, free):
 
 def of_forces(given):
     found = hf.forces(given.magnet, given.session)
-    return forces.answer(found), [f"{decimals(found.in_place.magnitude.max())}\u00a0N", "of 16",
-                                  f"{found.mass_kg.sum():.4g} kg"]
+    return forces_page.answer(found), [
+        f"{decimals(found.in_place.magnitude.max())}\u00a0N", "of 16",
+        f"{found.mass_kg.sum():.4g} kg"]
 
 
 def test_the_force_on_a_ring_is_that_of_its_blocks_together(given):
@@ -323,13 +325,13 @@ def test_the_force_on_a_ring_is_that_of_its_blocks_together(given):
     ring = np.array([block.ring for block in found.blocks])
     together = found.in_place.force_N[ring == 1].sum(axis=0)
     assert abs(together[2]) > 10 * np.hypot(*together[:2])
-    said = forces.answer(found).said
-    assert f"pushed by {forces._newton(float(np.linalg.norm(together)))}" in said
+    said = forces_page.answer(found).said
+    assert f"pushed by {forces_page._newton(float(np.linalg.norm(together)))}" in said
     named = int(re.search(r"the blocks of ring (\d) are pushed", said)[1])
     sign = "+" if found.in_place.force_N[ring == named].sum(axis=0)[2] > 0 else "−"
     assert f"(x, y, z: +0.00, +0.00, {sign}1.00)" in said
     single = build_magnet(given.study.with_(array__rings=1))
-    assert "are pushed by" not in forces.answer(hf.forces(single, given.session)).said
+    assert "are pushed by" not in forces_page.answer(hf.forces(single, given.session)).said
 
 
 def test_the_block_that_loses_most_is_named(given):
@@ -337,7 +339,7 @@ def test_the_block_that_loses_most_is_named(given):
     def said(temperature):
         magnet = build_magnet(given.study.with_(demagnetization__temperature_C=temperature))
         found = hf.demagnetization(magnet, given.session, across=2)
-        return demagnetization.answer(found), found
+        return demagnetization_page.answer(found), found
 
     hot, found = said(140.0)
     most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
@@ -356,42 +358,42 @@ def test_the_block_that_loses_most_is_named(given):
         one = np.flatnonzero(kept.cells.block[kept.places.cell] == 0)[0]
         along[one], volumes[one] = -1e8, share * whole
         lost = replace(kept, places=replace(kept.places, along=along, volumes=volumes))
-        assert 0 < lost.share_beyond_now < demagnetization.VERY_EDGES
-        assert demagnetization.answer(lost).said.startswith(word)
+        assert 0 < lost.share_beyond_now < demagnetization_page.VERY_EDGES
+        assert demagnetization_page.answer(lost).said.startswith(word)
 
 
 def of_plan(given):
     found = hf.plan(given.magnet, given.session, points=6)
     left = np.exp(-found.gain[-1] / len(found.parameters))
     every = np.exp(-found.baseline_gain[-1] / len(found.parameters))
-    return plan.answer(found), ["6 positions", f"{100 * left:.1f}", f"{100 * every:.1f}"]
+    return plan_page.answer(found), ["6 positions", f"{100 * left:.1f}", f"{100 * every:.1f}"]
 
 
 def of_prior(given):
     found = prior_from_blocks(given.magnet, given.campaign.blocks)
     spread = np.sqrt(np.mean(found.gaussian.sd**2) / np.mean(found.nominal**2))
-    return prior.answer(found), ["16 measured blocks", f"{100 * spread:.1f}"]
+    return prior_page.answer(found), ["16 measured blocks", f"{100 * spread:.1f}"]
 
 
 def of_sort(given):
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     size = np.sqrt(np.mean(found.best.sizes**2))
     low, high = np.quantile(found.random, [0.025, 0.975])
-    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv",
-                                   f"in 95 % of random orders {low:.3g} to {high:.3g}"]
+    return sorting_page.answer(found), [f"{size:.3g} units", "blocks.sorted.csv",
+                                        f"in 95 % of random orders {low:.3g} to {high:.3g}"]
 
 
 def test_sort_says_whether_its_limit_is_met(given):
     """An answer without a word of it said "Yes" of magnets 30 times beyond; a wide one is met."""
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
-    assert "with a probability" not in sorting.answer(found).said  # without a limit
+    assert "with a probability" not in sorting_page.answer(found).said  # without a limit
     largest = found.best.sizes.max()
-    narrow, wide = (sorting.answer(replace(found, limit=float(part * largest))).said
+    narrow, wide = (sorting_page.answer(replace(found, limit=float(part * largest))).said
                     for part in (0.5, 10.0))
     assert "probability of less than 0.1\u00a0%. Sorting does not reach that limit." in narrow
     assert "with a probability of more than 99.9\u00a0%." in wide
     assert "reach" not in wide
-    content = sorting.page(replace(found, limit=float(10 * largest))).summary
+    content = sorting_page.page(replace(found, limit=float(10 * largest))).summary
     assert content["probability_within_limit"] == 1.0
 
 
@@ -399,7 +401,7 @@ def test_sort_of_blocks_that_are_alike_says_that_they_are(given):
     """The slots of a type may all take the same blocks: not only those at one angle may change."""
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     found = replace(found, random=np.full(len(found.random), found.best.rms_of_mean))
-    said = sorting.answer(found)
+    said = sorting_page.answer(found)
     assert said.said.startswith("It does not matter")
     assert "alike as measured" in said.trust
     assert "at the same angle" not in said.trust
@@ -417,16 +419,16 @@ def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings,
     study = parse_study(changed(MAGNET, array__rings=rings, prior={
         "magnitude_sd": 0.05, "direction_sd_deg": 1.0} | ({"types": types} if types else {})))
     found = hf.sort(build_magnet(study), simulate_campaign(study, 3).blocks, given.session)
-    write_files(sorting.page(found), tmp_path)
+    write_files(sorting_page.page(found), tmp_path)
     text = (tmp_path / "sort.html").read_text()
     assert said in text
     assert ("as placed in the table" in text) == (said == "random orders")
     assert "The order hardly matters" not in text  # the control of the test of that
-    named = ", ".join(row["blocks, slot by slot"] for row in sorting.place_table(found))
+    named = ", ".join(row["blocks, slot by slot"] for row in sorting_page.place_table(found))
     order = np.lexsort((found.table.slot, found.table.ring)).tolist()
     assert named.split(", ") == [found.table.serial[row] for row in order]
     assert "1 to 8" in text
-    assert ("b_n" in sorting.order_table(found)[0]) != (said == "random orders")
+    assert ("b_n" in sorting_page.order_table(found)[0]) != (said == "random orders")
     if said == "random orders":
         assert found.best.rms_of_mean < found.random.min()
     else:
@@ -438,7 +440,7 @@ def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings,
 def of_shim(given):
     found = hf.shim(given.updated, given.session, swaps=1, turns=0)
     after = np.sqrt(found.after.expected_square / len(found.after.orders))
-    return shimming.answer(found), [
+    return shimming_page.answer(found), [
         f"{after:.3g} units", f"{len(found.steps)} move" if found.steps else "No move"]
 
 
@@ -446,7 +448,7 @@ def of_tolerance(given):
     sizes = hf.tolerance(given.magnet, given.session, draws=200).sizes.max(axis=1)
     found = hf.tolerance(given.magnet, given.session, draws=200,
                          limit_units=float(np.quantile(sizes, 0.3)))
-    return tolerance.answer(found), [
+    return tolerance_page.answer(found), [
         with_error(100 * found.share, 100 * found.share_sd), "200 magnets"]
 
 
@@ -455,21 +457,21 @@ def test_tolerance_sends_to_sort_where_blocks_can_change_places(types, told):
     """Of one ring without prior.types `sort` has nothing to sort."""
     magnet = hf.halbach_ring(order=2, blocks=8, inner_radius_m=0.02, outer_radius_m=0.04).with_(
         prior__types=types)
-    step = tolerance.answer(hf.tolerance(magnet, draws=200)).step
+    step = tolerance_page.answer(hf.tolerance(magnet, draws=200)).step
     assert ("Every slot is a type of its own" in step) == told
     assert "prior.types" in step or not told
 
 
 def of_demagnetization(given):
     found = hf.demagnetization(given.magnet, given.session, across=2)
-    return demagnetization.answer(found), [
+    return demagnetization_page.answer(found), [
         f"{1e-3 * found.margin.min():+.0f} kA/m", "Yes: at 60\u00a0°C", "ring "]
 
 
 def of_simulate(given):
     readings = given.campaign.readings
-    return (campaign.answer(given.study, readings, given.campaign.held_out,
-                            len(given.campaign.blocks)),
+    return (simulated_campaign_page.answer(given.study, readings, given.campaign.held_out,
+                                           len(given.campaign.blocks)),
             ["40 points", "16 single blocks", flux_density(
                 float(np.nanmax(np.abs(readings["B_T"].values))), 4), "10\u00a0µT"])
 
@@ -484,7 +486,7 @@ def of_field(given):
     lines = hf.Lines((0, 0, -0.2), (0, 0, 0.2), count=41)
     found = hf.field(given.magnet, lines, given.session)
     first, sd = found.integrals(1)
-    return field.answer(found), [
+    return field_page.answer(found), [
         flux_density(float(np.linalg.norm(found.mean, axis=2).max()), 4), "1 line of 41 points",
         with_error(float(first[0, 0]), float(sd[0, 0])), "as ordered"]
 
@@ -685,7 +687,7 @@ def test_the_parts_of_a_deviation_add_up(given):
     """By squares, to what the answer says; an angle in degrees is a part of the length."""
     found = prior_from_blocks(given.magnet, given.campaign.blocks)
     assert len(found.nominal) == 3 * len(given.magnet.blocks)
-    for row, size in zip(prior.parts_table(found), (
+    for row, size in zip(prior_page.parts_table(found), (
             found.gaussian.mean - found.nominal, found.gaussian.sd), strict=True):
         _, length, *angles, together = row.values()
         assert len(angles) == 2
@@ -718,12 +720,12 @@ def test_commands_name_the_posterior_that_was_read(given):
     of_field = hf.homogeneity(given.magnet, given.session, posterior=given.updated)
     name, known = list(of_field.by_name.items())[-1]
     even = replace(of_field, by_name={name: replace(known, rms_ppm=900.0)})
-    for found in (homogeneity.answer(even), shimming.answer(still)):
+    for found in (homogeneity_page.answer(even), shimming_page.answer(still)):
         assert "DIR/posterior.h5" not in found.command
         assert "--posterior POSTERIOR" in found.command
     # the control: no tray makes up for per cents
-    assert homogeneity.answer(of_field).command == "halbach-fe design STUDY -o DIR"
-    assert f"A deviation of {1e-4 * known.rms_ppm:.2g} %" in homogeneity.answer(of_field).step
+    assert homogeneity_page.answer(of_field).command == "halbach-fe design STUDY -o DIR"
+    assert f"A deviation of {1e-4 * known.rms_ppm:.2g} %" in homogeneity_page.answer(of_field).step
 
 
 def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_path):
@@ -737,8 +739,9 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
         stored = read_posterior(given.magnet, folder / "posterior.h5")
         assert stored.disagreement == update.disagreement
         found = hf.multipoles(given.magnet, given.session, posterior=stored)
-        said = multipoles.answer(found.tables, None, found.disagreement)
-        even = homogeneity.answer(hf.homogeneity(given.magnet, given.session, posterior=update))
+        said = multipoles_page.answer(found.tables, None, found.disagreement)
+        even = homogeneity_page.answer(
+            hf.homogeneity(given.magnet, given.session, posterior=update))
         for one in (said, even):
             assert one.sound == sound
             assert one.trust.startswith("Yes: " if sound else "No. ")
@@ -749,21 +752,22 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
     assert "agree better than the stated noise allows" in near.said
     assert "diagnose" in of_a_conflict("?", "It is so.", "It is far.").command  # the control
     unknown = hf.multipoles(given.magnet, given.session, posterior=dict(stored))
-    assert "which its own page says" in multipoles.answer(unknown.tables, None,
-                                                          unknown.disagreement).trust
+    assert "which its own page says" in multipoles_page.answer(unknown.tables, None,
+                                                               unknown.disagreement).trust
 
 
 def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     everything = hf.plan(given.magnet, given.session)
-    said = plan.answer(everything)
+    said = plan_page.answer(everything)
     few = int(said.said.split("the first ")[1].split(" ")[0])
     assert 0 < few < len(everything.points)
     left = np.exp(-everything.gain / len(everything.parameters))
     assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
     assert "tell more" not in said.said
     assert "plan.points" in said.step
-    assert "more than" not in str(plan.plan_table(everything))
-    assert "plan.points" not in plan.answer(hf.plan(given.magnet, given.session, points=6)).step
+    assert "more than" not in str(plan_page.plan_table(everything))
+    six = hf.plan(given.magnet, given.session, points=6)
+    assert "plan.points" not in plan_page.answer(six).step
 
 
 def test_blocks_that_share_the_largest_force_are_named(given):
@@ -772,7 +776,7 @@ def test_blocks_that_share_the_largest_force_are_named(given):
     size = found.in_place.magnitude
     equal = np.flatnonzero(size >= 0.999 * size.max())
     assert 1 < len(equal) < len(size)
-    said = forces.answer(found).said
+    said = forces_page.answer(found).said
     assert f"as large on {len(equal) - 1} other" in said
     for number in equal[equal != np.argmax(size)]:
         block = found.blocks[number]
@@ -782,15 +786,15 @@ def test_blocks_that_share_the_largest_force_are_named(given):
     vectors = found.in_place.force_N.copy()
     vectors[np.argmax(size)] *= 1.01
     alone = replace(found, in_place=replace(found.in_place, force_N=vectors))
-    assert "as large on" not in forces.answer(alone).said
-    figure = forces.forces_figure(found)
+    assert "as large on" not in forces_page.answer(alone).said
+    figure = forces_page.forces_figure(found)
     numbers = {text.get_text() for text in figure.axes[0].texts}
     assert numbers == {str(slot) for slot in range(1, 9)}
 
 
 def test_means_that_are_zero_but_for_the_mesh_are_zero(given):
     found = hf.tolerance(given.magnet, given.session, draws=50)
-    (table,) = tolerance.page(found).tables.values()
+    (table,) = tolerance_page.page(found).tables.values()
     rows = {row["n"]: row["|c_n| of the mean magnet"] for row in table}
     assert rows["2"] == "0"  # forbidden by the symmetry
     assert float(rows["9"]) > 1  # which eight cubes do make
@@ -813,8 +817,8 @@ def test_scattered_points_have_maps_and_no_profile(given, scattered):
 def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tmp_path):
     """The table has what plan.csv has; blocks and patterns are two quantities with two names."""
     found = hf.plan(given.magnet, given.session, points=6)
-    write_files(plan.page(found), tmp_path)
-    rows = plan.chosen_table(found)
+    write_files(plan_page.page(found), tmp_path)
+    rows = plan_page.chosen_table(found)
     stored = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)
     # 1 µm is the last digit of the table
     np.testing.assert_allclose([[float(row[f"{axis} in mm"]) for axis in "xyz"] for row in rows],
@@ -825,10 +829,10 @@ def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tm
     assert all(f">{row['x in mm']}<" in text for row in rows)
     assert "uncertainty that remains" not in text
     assert "The stage's own" not in text
-    turned = plan.page(replace(found, magnet=found.magnet.with_(
+    turned = plan_page.page(replace(found, magnet=found.magnet.with_(
         instrument__position_axes=("y", "-x", "z"), instrument__length_unit_m=1e-3)))
     assert "x, y and z are y, -x, z of these, in units of 0.001 m" in str(turned.sections)
-    left, of_study = (plan.plan_table(found)[3][key] for key in ("plan", "the study's"))
+    left, of_study = (plan_page.plan_table(found)[3][key] for key in ("plan", "the study's"))
     # each is rounded to 0.1 %
     assert float(left[:-2]) / float(of_study[:-2]) == pytest.approx(found.volume_ratio, abs=3e-3)
 
@@ -851,11 +855,11 @@ def test_moves_that_the_answer_is_against_are_no_instructions(given, tmp_path):
                                                                True),
             ("conflict", worthwhile, wrong, True)):
         moves = replace(moves, result=result)
-        write_files(shimming.page(moves), tmp_path / name)
+        write_files(shimming_page.page(moves), tmp_path / name)
         text = (tmp_path / name / "shim.html").read_text()
         assert ("Moves that would be made" in text) == against
-        assert shimming.answer(moves).step.startswith("Make the moves") != against
-    drawn = shimming._moves_figure(found).legends[0].texts
+        assert shimming_page.answer(moves).step.startswith("Make the moves") != against
+    drawn = shimming_page._moves_figure(found).legends[0].texts
     assert [text.get_text() for text in drawn] == ["blocks that are exchanged"]
 
 
@@ -864,7 +868,7 @@ def test_moves_that_the_answer_is_against_are_no_instructions(given, tmp_path):
     (1263.4, 4.34, "+1\u202f263.4 ± 4.3"), (0.0, 1594.2, "0 ± 1\u202f594"),
     (0.01, 2.71, "0.0 ± 2.7"), (-3.2, 0.012, "-3.200 ± 0.012")])
 def test_harmonics_and_their_errors_end_with_one_digit(value, sd, shown):
-    assert homogeneity._ppm_with_sd(value, sd) == shown
+    assert homogeneity_page._ppm_with_sd(value, sd) == shown
 
 
 def test_none_and_all_of_the_magnets_have_no_error_bar():
@@ -880,7 +884,7 @@ def test_a_boundary_that_is_too_near_is_moved_before_the_mesh_is_refined(dipole,
             open_boundary={} if radius is None else {"radius_m": radius},
             array__recoil_permeability=1.05,
             noise={"regions": [{"name": "bore", "sigma_T": 1e-9}]}))
-        said = verification.answer(hf.verify(magnet, session)).step
+        said = verification_page.answer(hf.verify(magnet, session)).step
         assert ("open_boundary.radius_m larger (now 300 mm)" in said) == moved
         assert ("smaller mesh.block_size_m" in said) != moved
 
@@ -896,47 +900,47 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
         return replace(found, steps=tuple(replace(found.steps[0], after=sized(part))
                                           for part in parts))
 
-    said = shimming.answer(of_sizes(0.5, 0.3, 0.28, 0.27)).said
+    said = shimming_page.answer(of_sizes(0.5, 0.3, 0.28, 0.27)).said
     assert (" The first 2 make 96\u00a0% of that gain: stop after them if a move costs more than "
             "the rest is worth. What remains is mostly b_9, ") in said
-    assert "The first" not in shimming.answer(of_sizes(0.8, 0.5)).said  # control
+    assert "The first" not in shimming_page.answer(of_sizes(0.8, 0.5)).said  # control
     assert "together" not in said
-    paired = shimming.answer(of_sizes(0.5, 0.52, 0.53, 0.45, 0.46, 0.3)).said
+    paired = shimming_page.answer(of_sizes(0.5, 0.52, 0.53, 0.45, 0.46, 0.3)).said
     assert "Moves 2, 3 and 4 gain only together" in paired
     assert "Moves 5 and 6 gain only together" in paired
     still = replace(found, steps=(), within=None)
-    assert shimming.answer(still).said.startswith("No move is worthwhile: of ")
+    assert shimming_page.answer(still).said.startswith("No move is worthwhile: of ")
     # without any move allowed, nothing is known of moves
-    untried = shimming.answer(replace(still, tried=dict.fromkeys(still.tried, 0)))
+    untried = shimming_page.answer(replace(still, tried=dict.fromkeys(still.tried, 0)))
     assert untried.said.startswith("No move was tried: the unwanted multipoles are ")
     vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],
                                           root=found.before.root))
-    assert "which is most of it" in shimming.answer(vague).said
+    assert "which is most of it" in shimming_page.answer(vague).said
     sure = replace(still, before=replace(found.before, root=1e-3 * found.before.root))
-    assert "which is most of it" not in shimming.answer(sure).said  # the control
-    write_files(shimming.page(sure), tmp_path / "still")
+    assert "which is most of it" not in shimming_page.answer(sure).said  # the control
+    write_files(shimming_page.page(sure), tmp_path / "still")
     text = (tmp_path / "still" / "shim.html").read_text()
     assert "b_n after" not in text
-    assert [*shimming.page(sure).rows[0]] == ["n", "b_n", "a_n"]
+    assert [*shimming_page.page(sure).rows[0]] == ["n", "b_n", "a_n"]
     assert "before and after" not in text.partition("</header>")[2].partition("<details")[0]
-    assert [*shimming.page(found).rows[0]] == ["n", "b_n before", "b_n after", "a_n before",
-                                                 "a_n after"]
+    assert [*shimming_page.page(found).rows[0]] == ["n", "b_n before", "b_n after", "a_n before",
+                                                      "a_n after"]
 
 
 def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     """And says that a map which tells little of the blocks does so."""
-    every = plan.answer(hf.plan(given.magnet, given.session)).said
+    every = plan_page.answer(hf.plan(given.magnet, given.session)).said
     assert "the positions of the study, and the plan only orders them" in every
     assert "as many of the study's own positions" not in every
     assert "the first 1 " not in every
     open_terms = replace(hf.plan(given.magnet, given.session),
                          magnet=given.magnet.with_(instrument_sd={"gain": 0.02}))
-    assert "instrument" not in plan.answer(open_terms).trust  # which is in the plan
-    assert "drift that [instrument_sd] leaves open is not in them" in plan.answer(replace(
+    assert "instrument" not in plan_page.answer(open_terms).trust  # which is in the plan
+    assert "drift that [instrument_sd] leaves open is not in them" in plan_page.answer(replace(
         open_terms, magnet=given.magnet.with_(instrument_sd={"drift_T": 1e-5}))).trust
     assert "tells little of the single blocks" not in every  # the control
     noisy = build_magnet(given.study.with_(noise={"regions": [{"name": "all", "sigma_T": 1.0}]}))
-    vague = plan.answer(hf.plan(noisy, given.session)).said
+    vague = plan_page.answer(hf.plan(noisy, given.session)).said
     assert "tells little of the single blocks" in vague
     assert "the first 1 " not in vague
 
@@ -947,23 +951,23 @@ def test_candidates_that_tell_less_than_the_study_are_no_places_to_measure(given
     """
     far = given.magnet.with_(plan={"candidates": [{
         "kind": "line", "start_m": (0.3, 0.0, 0.0), "end_m": (0.34, 0.0, 0.0), "count": 5}]})
-    said = plan.answer(hf.plan(far, given.session, points=3))
+    said = plan_page.answer(hf.plan(far, given.session, points=3))
     assert "so that these are better places" in said.said
     assert "hardly more" not in said.said
     assert not said.sound
     assert "plan.candidates" in said.step
     found = hf.plan(given.magnet, given.session, points=3)
-    near = plan.answer(found)  # the control
+    near = plan_page.answer(found)  # the control
     assert near.sound
     assert "better places" not in near.said
-    monkeypatch.setattr(plan, "_patterns", lambda _: (0.546, 0.485))
-    assert re.search(r"own positions to 48\.5\s%, about as far\.", plan.answer(found).said)
+    monkeypatch.setattr(plan_page, "_patterns", lambda _: (0.546, 0.485))
+    assert re.search(r"own positions to 48\.5\s%, about as far\.", plan_page.answer(found).said)
 
 
 def test_a_plan_says_that_its_readings_are_not_held_out(given):
     """The update that it advises holds some out; without such readings nothing is said."""
-    trust = [plan.answer(hf.plan(given.magnet.with_(inference={"held_out": held_out}),
-                                 given.session, points=3)).trust
+    trust = [plan_page.answer(hf.plan(given.magnet.with_(inference={"held_out": held_out}),
+                                      given.session, points=3)).trust
              for held_out in ({"every": 4}, None)]
     assert ["inference.held_out" in each for each in trust] == [True, False]
 
@@ -1009,7 +1013,7 @@ def test_an_undulator_is_sent_to_its_axis(tmp_path, monkeypatch):
     noise = 1e-5 * np.random.default_rng(1).standard_normal((len(points), 3))
     found = hf.infer(magnet, points, magnet.field_T(points) + noise, sigma_T=1e-5)
     hf.write_report(found, "inferred")
-    for said, measured in ((solution.answer(hf.solve(magnet, Session.temporary())), False),
+    for said, measured in ((solution_page.answer(hf.solve(magnet, Session.temporary())), False),
                            (inference_answer.answer(found), True)):
         assert "an undulator has no mean field" in said.step
         words = said.command.replace("STUDY", "study.toml").replace(
@@ -1037,13 +1041,13 @@ def test_an_order_that_hardly_matters(given):
     own = found.numbered
     alike = replace(found, best=replace(own, mean=0.99 * own.mean),
                     random=own.rms_of_mean * np.linspace(1, 1.0003, len(found.random)))
-    said = sorting.answer(alike)
+    said = sorting_page.answer(alike)
     assert said.said.startswith("The order hardly matters: the sorted one is 1\u00a0% better")
     assert "in all random orders about" in said.said
     assert "or in another one that you write into blocks.sorted.csv" in said.step
     assert "To gain more, measure spare blocks" in said.step  # all that are alike are of one type
     apart = replace(alike, study=alike.study.with_(prior__types={}))
-    assert "To gain more, let more slots take the same blocks" in sorting.answer(apart).step
+    assert "To gain more, let more slots take the same blocks" in sorting_page.answer(apart).step
 
 
 def test_an_order_is_compared_with_the_table_and_with_random_ones(given):
@@ -1052,10 +1056,10 @@ def test_an_order_is_compared_with_the_table_and_with_random_ones(given):
     found = hf.sort(magnet, given.campaign.blocks, given.session)
     own = found.numbered
     best = replace(own, mean=0.99 * own.mean)
-    said = sorting.answer(replace(found, best=best, random=2 * found.random)).said
+    said = sorting_page.answer(replace(found, best=best, random=2 * found.random)).said
     assert said.startswith("The order of the table is nearly as good already.")
     random = own.rms_of_mean * np.linspace(1, 1.0003, len(found.random))
-    said = sorting.answer(replace(
+    said = sorting_page.answer(replace(
         found, best=best, numbered=replace(own, mean=2 * own.mean), random=random)).said
     assert said.startswith("A random order is nearly as good.")
 
@@ -1066,9 +1070,9 @@ def test_what_only_the_tolerances_make_is_named_beside_the_design():
         model=SimpleNamespace(orders=(2, 3, 9)), known=SimpleNamespace(sizes=np.array([0, 1, 148])),
         quantiles=np.array([[1, 2, 147], [5, 25.9, 148], [9, 54, 149], [10, 60, 150]]))
     assert ("The largest multipole that only the tolerances make is c_3: below 25.9 units in half "
-            "of the magnets, below 54 in 95 %.") in tolerance._made_by_tolerances(found)
+            "of the magnets, below 54 in 95 %.") in tolerance_page._made_by_tolerances(found)
     found.known.sizes = np.array([5, 25, 148])
-    assert tolerance._made_by_tolerances(found) == ""
+    assert tolerance_page._made_by_tolerances(found) == ""
 
 
 def test_error_bars_that_take_the_probe_as_exact_say_so(given):

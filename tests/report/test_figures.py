@@ -12,8 +12,8 @@ import halbach_fe as hf
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.page import begin_at_zero, write_report
-from halbach_fe.report.prior import type_table
-from halbach_fe.report.solution import field_figure
+from halbach_fe.report.prior_page import type_table
+from halbach_fe.report.solution_page import field_figure
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import DIPOLE, changed, parse_study

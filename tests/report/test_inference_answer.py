@@ -12,8 +12,8 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, Amplitudes, InferenceResult, Stretch, far_in_words
-from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
+from halbach_fe.report.inference_page import score_table, term_table
 from halbach_fe.report.words import flux_density, ppm
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign

@@ -13,7 +13,7 @@ import tomlkit
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report import magnet_view_3d, page, point_maps
-from halbach_fe.report import solution as solution_page
+from halbach_fe.report import solution_page as solution_page
 from halbach_fe.report.magnet_view_3d import cut_trace
 from halbach_fe.report.page import write_files
 from halbach_fe.report.words import in_one_line, magnet_rows

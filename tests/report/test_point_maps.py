@@ -11,7 +11,7 @@ from matplotlib.collections import QuadMesh
 from halbach_fe.measurement.positions import on_grid
 from halbach_fe.report.diagnosis_figures import _line
 from halbach_fe.report.point_maps import curve, maps_figure, panels, residual_figure
-from halbach_fe.study.study_file import MagnetTemplate, new_study, parse_new_study
+from halbach_fe.study.writer import MagnetTemplate, new_study, parse_new_study
 from tests.conftest import circle
 
 CIRCLES = np.vstack([circle(0.03, 12, z) for z in np.linspace(-0.05, 0.05, 7)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import response_matrix
 from tests.conftest import circle

@@ -9,7 +9,7 @@ from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.observation import flux_density_at, observe
+from halbach_fe.measurement.observation_operator import flux_density_at, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import discretization_error
 from halbach_fe.response.discretization_error import farther, reading_errors, refined

@@ -20,9 +20,9 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.files import import_map
-from halbach_fe.report.field import answer
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.import_export import import_map
+from halbach_fe.report.field_page import answer
 from halbach_fe.response.field_on_lines import Lines, field_on_lines
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian

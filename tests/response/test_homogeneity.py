@@ -22,7 +22,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import halbach_ring, magnet_of_blocks
-from halbach_fe.report.homogeneity import answer
+from halbach_fe.report.homogeneity_page import answer
 from halbach_fe.report.page import write_report
 from halbach_fe.response.homogeneity import extremes, real_harmonics
 from halbach_fe.response.region import (

@@ -12,7 +12,7 @@ from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_report
-from halbach_fe.report.verification import answer
+from halbach_fe.report.verification_page import answer
 from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.discretization_error import observed_order, refined, verify
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field

@@ -14,9 +14,9 @@ from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.coils import distance_from_axis, points_in_winding
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import halbach_ring, magnet_of_blocks
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.multipoles import answer, middle_circle, reference_text
+from halbach_fe.report.multipoles_page import answer, middle_circle, reference_text
 from halbach_fe.response import multipoles
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
@@ -32,11 +32,11 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.external import External
-from halbach_fe.study.inference import shifted
+from halbach_fe.study.external_keys import External
+from halbach_fe.study.inference_keys import shifted
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed
 
 ORDERS = (1, 2, 3, 4, 5, 6)

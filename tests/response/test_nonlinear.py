@@ -19,7 +19,7 @@ import pytest
 from halbach_fe.core.errors import EXIT_CODES, GetDPError, NotConvergedError
 from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import Observation, observe
+from halbach_fe.measurement.observation_operator import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import nonlinear as engine
 from halbach_fe.response.discretization_error import reading_errors
@@ -43,9 +43,9 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import ConstitutiveLaw
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
 from halbach_fe.synthetic.true_magnet import law_of
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed, circle
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 

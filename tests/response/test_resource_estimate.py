@@ -13,7 +13,7 @@ import pytest
 from halbach_fe import geo
 from halbach_fe.geo import magnet_meshes
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
 from halbach_fe.response.discretization_error import reading_errors, refined

@@ -10,7 +10,12 @@ from scipy.spatial.transform import Rotation
 import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_rows, stray_title
+from halbach_fe.report.homogeneity_page import (
+    sections_of_stray,
+    stray_figure,
+    stray_rows,
+    stray_title,
+)
 from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import DISTANCES, NEAREST, _farthest, stray_field
@@ -18,8 +23,8 @@ from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed
 from tests.support.cuboids import DOCUMENT
 

@@ -12,10 +12,10 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.coils import distance
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import coil_field, external_field
-from halbach_fe.study.external import External
+from halbach_fe.study.external_keys import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed
 
 PLACE = {"centre_m": [0.01, -0.02, 0.03], "rotation_deg": [30.0, -50.0, 20.0]}

@@ -20,7 +20,7 @@ import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import ExtraMissingError, GetDPError, SchedulerError
-from halbach_fe.core.untrusted import write_hdf5
+from halbach_fe.core.untrusted_files import write_hdf5
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.getdp import ENVIRONMENT_VARIABLE
 from halbach_fe.solver.routes import solve_nominal

@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.core.errors import GetDPError
 from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes, interpolation
 from halbach_fe.solver.azimuthal_modes import solve_modes

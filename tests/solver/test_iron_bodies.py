@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError, HalbachWarning, MeshError, StudyError
-from halbach_fe.geo import iron_bodies as geo_bodies
-from halbach_fe.geo.iron_bodies import Sizes, check_apart, mesh_iron
-from halbach_fe.geo.session import gmsh_session
+from halbach_fe.geo import iron_mesh as geo_bodies
+from halbach_fe.geo.gmsh_session import gmsh_session
+from halbach_fe.geo.iron_mesh import Sizes, check_apart, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -41,8 +41,8 @@ from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import RunSize
 from halbach_fe.study.model import MeshSettings
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.geometry.test_iron import CHAMFERED, draw_prism, stl_of_step, triangles_of_box
 
 SPHERE = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.0, 0.05]}

@@ -7,7 +7,7 @@ import pytest
 
 from halbach_fe.core.errors import GetDPError, HalbachWarning, MeshError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.magnetostatics import edge_elements, solve_sources

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeshError, StudyError
-from halbach_fe.core.untrusted import read_mesh
+from halbach_fe.core.untrusted_files import read_mesh
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.mesh import MeshFiles, build_meridian, build_mesh, verify_mesh
 from halbach_fe.study.reader import read_study

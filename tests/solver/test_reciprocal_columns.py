@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.core.errors import GetDPError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import unique_points
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.resource_estimate import decisive_points
 from halbach_fe.solver import iron_modes, routes

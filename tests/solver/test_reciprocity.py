@@ -11,7 +11,7 @@ from scipy.sparse.linalg import spsolve
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.dofs import read_solutions, read_unknowns
+from halbach_fe.solver.getdp_files import read_solutions, read_unknowns
 from halbach_fe.solver.interpolation import locate, probes_of
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,

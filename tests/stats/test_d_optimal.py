@@ -19,7 +19,7 @@ from halbach_fe.design.measurement_plan import (
 )
 from halbach_fe.design.objective import deviation_model
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.homogeneity import homogeneity_model

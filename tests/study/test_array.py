@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.array_layout import ring_limits
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.array import Array
+from halbach_fe.study.array_keys import Array
 from halbach_fe.study.materials import grade
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed

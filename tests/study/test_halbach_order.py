@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors
-from halbach_fe.study.array import check_order
+from halbach_fe.study.array_keys import check_order
 from tests.oracles.sectors import bore_field
 
 INNER, OUTER, RADIUS = 1.0, 1.5, 0.1

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.interpolate import PchipInterpolator
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.matrix import _key
 from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.iron import TableCurve
+from halbach_fe.study.iron_keys import TableCurve
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import curve_of
 from halbach_fe.study.reader import parse_study, read_study

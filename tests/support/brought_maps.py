@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.storage import read_posterior
+from halbach_fe.inference.posterior_files import read_posterior
 from halbach_fe.stats.gaussian import by_readings_alone
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.simulate import draw_magnet, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 WEAK = 0.03
 """What a weak block lacks of its magnetization: three standard deviations of the prior."""

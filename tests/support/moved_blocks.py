@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.synthetic.bodies import vector
+from halbach_fe.synthetic.true_magnet_of_study import vector
 
 
 def moved(bodies, loose, shimmed, remount=None):

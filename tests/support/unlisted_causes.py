@@ -24,9 +24,9 @@ from halbach_fe.core.installation import import_extra
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.simulate import SECONDS, check_air, draw_magnet, point_noise, true_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 
 Coordinate = Literal["z", "angle", "radius", "time", "field"]
 """What a random function depends on; ``field`` is the magnitude of B."""

@@ -13,15 +13,15 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.moments.solve import solve_moments
-from halbach_fe.study.array import Array, BlockException, Ring
+from halbach_fe.study.array_keys import Array, BlockException, Ring
 from halbach_fe.study.free_blocks import COLUMNS, SIZES
-from halbach_fe.study.iron import IronPrism, IronTube, PlacedIron
+from halbach_fe.study.iron_keys import IronPrism, IronTube, PlacedIron
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.reaction import separate_reaction
 from halbach_fe.synthetic.shapes import SectorBody
 from halbach_fe.synthetic.simulate import true_field
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed, circle
 
 POINTS = np.vstack([circle(0.04, 5, z, 0.2 + z) for z in (-0.11, 0.004, 0.06)])

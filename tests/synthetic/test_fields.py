@@ -12,11 +12,11 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.routes import finite_element_part, solve_nominal
 from halbach_fe.synthetic import magpylib_field
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
 from halbach_fe.synthetic.simulate import true_field as full_field
 from halbach_fe.synthetic.true_magnet import BodyPart, vector
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import circle
 
 SHAPES = [

@@ -17,7 +17,6 @@ from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import parse_study, read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
     choose_effects,
@@ -32,6 +31,7 @@ from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import measured, simulate_campaign, true_field
 from halbach_fe.synthetic.true_magnet import check_room
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, ROOT, changed
 
 RINGS = changed(

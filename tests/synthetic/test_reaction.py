@@ -12,10 +12,10 @@ from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.synthetic import ngsolve_reaction, reaction
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, PrismBody, SectorBody
 from halbach_fe.synthetic.simulate import coil_table, moments
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import circle
 from tests.oracles.lone_block import block_mesh, moment_matrix
 from tests.solver.test_iron_bodies import study_with

@@ -18,7 +18,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, points_of, read_map
-from halbach_fe.measurement.observation import fourier_analysis, observe
+from halbach_fe.measurement.observation_operator import fourier_analysis, observe
 from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.words import flux_density
@@ -26,7 +26,6 @@ from halbach_fe.solver.exact_block_field import demagnetizing_tensors, gradient_
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
-from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.reaction import lone_moment_matrix
 from halbach_fe.synthetic.simulate import (
@@ -36,6 +35,7 @@ from halbach_fe.synthetic.simulate import (
     simulate_campaign,
     write_campaign,
 )
+from halbach_fe.synthetic.true_magnet_of_study import magnet_of
 from tests.conftest import DIPOLE, changed
 from tests.support import short_dipole
 from tests.support.pages import page

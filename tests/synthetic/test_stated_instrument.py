@@ -11,14 +11,14 @@ from halbach_fe.api import simulate_measurement
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import is_total_field, points_of, read_map
-from halbach_fe.measurement.instrument import (
+from halbach_fe.measurement.probe_law import (
     in_si_and_magnet_axes,
     nonlinear_part,
     sensor_model,
     sensor_positions,
     with_memory,
 )
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects.instrument_effects import stated_places, stated_readings
 from halbach_fe.synthetic.simulate import simulate_campaign

@@ -1,4 +1,4 @@
-"""The catalogue of effects that the diagnosis searches for, grouped by what they act on.
+"""The catalogue of effects: what each changes, and the prior widths of its amplitudes.
 
 An effect is a deviation of the real magnet or mapper from the study: a displaced block, a gain
 error of a sensor, an iron ring that the study does not mention. Its amplitudes and their prior

@@ -1,4 +1,4 @@
-"""Base classes of effects, and functions that several effects share.
+"""What an effect is: parameters with their prior widths, places, signature, and how it is applied.
 
 Every effect has a name, parameters with priors, the places where it can occur, a signature (the
 change of the readings per unit of each parameter, to first order) and a method that applies it to a
@@ -19,8 +19,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.study.array import BlockException
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.array_keys import BlockException
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

@@ -24,7 +24,7 @@ from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.moments.solve import KneeLaw
 from halbach_fe.solver.routes import choose_route
-from halbach_fe.study.array import BlockException
+from halbach_fe.study.array_keys import BlockException
 from halbach_fe.study.materials import MOST_SQUARE, MU_0, Demagnetization, grade_of
 from halbach_fe.study.model import Study, iron_of
 

@@ -33,7 +33,7 @@ from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.array_layout import ring_limits
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.array import Array, BlockException
+from halbach_fe.study.array_keys import Array, BlockException
 from halbach_fe.study.model import Study
 
 X, Y, Z = np.eye(3)

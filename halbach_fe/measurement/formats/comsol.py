@@ -20,12 +20,12 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats import delimited_table, names
-from halbach_fe.measurement.formats.conversion import ForeignTable
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.grid import points_on
-from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.tables import (
+from halbach_fe.measurement.formats import column_names, delimited_table
+from halbach_fe.measurement.formats.column_names import ColumnName
+from halbach_fe.measurement.formats.columns_to_map import ForeignTable
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.grid_formats import points_on
+from halbach_fe.measurement.text_tables import (
     Line,
     comments_of,
     delimiter_of,
@@ -158,7 +158,7 @@ def _with_data(
             raise MeasurementError(must_be(
                 f"data of '{expression[:40]}'", where, f"{len(points)} values, one for each point",
                 str(len(data)), "Is the file cut short?"))
-        found.append(names.parse(expression))
+        found.append(column_names.parse(expression))
         values.append(data)
     return ForeignTable(tuple(found), np.column_stack(values), where)
 

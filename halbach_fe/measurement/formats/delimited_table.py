@@ -25,12 +25,12 @@ from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
     SIGMA_COLUMNS,
 )
-from halbach_fe.measurement.formats import names
-from halbach_fe.measurement.formats.conversion import ForeignTable, with_units
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import ColumnName
+from halbach_fe.measurement.formats import column_names
+from halbach_fe.measurement.formats.column_names import ColumnName
+from halbach_fe.measurement.formats.columns_to_map import ForeignTable, with_units
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
 from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
-from halbach_fe.measurement.tables import (
+from halbach_fe.measurement.text_tables import (
     MAX_LINE,
     RUN_TOGETHER,
     Line,
@@ -124,7 +124,7 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     _refuse_other_header(body, columns, delimiter, where)
     own = {column.text for column in columns} <= OWN_COLUMNS
-    stated = [names.parse(text, stated=True) for text in declared.columns] or columns
+    stated = [column_names.parse(text, stated=True) for text in declared.columns] or columns
     known = {column.quantity for column in stated}
     added, more = _in_comments(preface, body, known) if declared.positions is None else ([], [])
     if added:
@@ -255,7 +255,7 @@ def _in_comments(
                 at = at | {found[1].lower(): (float(found[2]), found[3] or "")}
         elif number >= len(preface) and not is_comment(line):
             by_row.append(at)
-    axes = [axis for axis in names.POSITIONS[:3] if axis not in known
+    axes = [axis for axis in column_names.POSITIONS[:3] if axis not in known
             and all(axis in row for row in by_row) and len({row[axis] for row in by_row}) > 1
             and len({row[axis][1] for row in by_row}) == 1]
     return ([ColumnName(axis, axis, by_row[0][axis][1]) for axis in axes],
@@ -388,9 +388,9 @@ def _header(
         for cells in map(_with_vector, _splits(line, delimiter)):
             if len(cells) == count + 1 and not cells[-1].strip():  # as the rows, with an empty end
                 cells = cells[:-1]
-            columns = names.with_axes([names.parse(cell) for cell in cells])
+            columns = column_names.with_axes([column_names.parse(cell) for cell in cells])
             known = sum(bool(column.quantity) for column in columns)
-            if len(cells) == count and not below and names.is_units(cells):
+            if len(cells) == count and not below and column_names.is_units(cells):
                 below = cells
                 break
             if len(cells) == count and known >= RECOGNIZED:
@@ -441,9 +441,9 @@ def _with_vector(cells: list[str]) -> list[str]:
     """Return names in which a last one of a vector, as of Ansys Maxwell, is that of components."""
     vector = next((n for n, cell in enumerate(cells) if VECTOR.match(cell[:MAX_LINE])), None)
     if vector is not None:
-        return [*cells[:vector], *names.FIELDS[:3]]
+        return [*cells[:vector], *column_names.FIELDS[:3]]
     if cells and SCALAR.fullmatch(cells[-1][:MAX_LINE]):
-        return [*cells[:-1], names.TOTAL]
+        return [*cells[:-1], column_names.TOTAL]
     return cells
 
 
@@ -471,7 +471,7 @@ def _refuse_other_length(
     if is_comment(line) or any(len(cells) == count or numbers_among(cells) for cells in splits):
         return
     for cells in splits:
-        known = [names.parse(cell).quantity for cell in cells]
+        known = [column_names.parse(cell).quantity for cell in cells]
         if sum(map(bool, known)) > RECOGNIZED and 2 * len(cells) >= count:
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",

@@ -25,10 +25,10 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats.conversion import ForeignTable
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import CARTESIAN, ColumnName, in_units
-from halbach_fe.measurement.tables import (
+from halbach_fe.measurement.formats.column_names import CARTESIAN, ColumnName, in_units
+from halbach_fe.measurement.formats.columns_to_map import ForeignTable
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.text_tables import (
     Line,
     comments_of,
     delimiter_of,

@@ -18,13 +18,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats.conversion import ForeignTable
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.grid import Grid
-from halbach_fe.measurement.formats.names import in_units
+from halbach_fe.measurement.formats.column_names import in_units
+from halbach_fe.measurement.formats.columns_to_map import ForeignTable
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
+from halbach_fe.measurement.formats.grid_formats import Grid
 from halbach_fe.study.types import COMPONENTS
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -49,7 +49,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         rectangular grid.
     """
     try:
-        with untrusted.open_hdf5(io.BytesIO(raw)) as file:
+        with untrusted_files.open_hdf5(io.BytesIO(raw)) as file:
             return _table(_only_mesh(file, where), where)
     except MeasurementError:
         raise
@@ -61,7 +61,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
 def is_map(raw: bytes) -> bool:
     """Return whether an HDF5 file holds a map of halbach-fe, which is no file of openPMD."""
     try:
-        with untrusted.open_hdf5(io.BytesIO(raw)) as file:
+        with untrusted_files.open_hdf5(io.BytesIO(raw)) as file:
             return "B_T" in file and "externalFieldPath" not in file.attrs
     except Exception:  # a damaged file makes h5py raise exceptions of any type
         return False

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.core import untrusted
+from halbach_fe.core import untrusted_files
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be, printable
-from halbach_fe.measurement.formats.conversion import ForeignTable
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import FIELDS, ColumnName, in_units, split_unit
+from halbach_fe.measurement.formats.column_names import FIELDS, ColumnName, in_units, split_unit
+from halbach_fe.measurement.formats.columns_to_map import ForeignTable
+from halbach_fe.measurement.formats.declared_format import DeclaredFormat
 from halbach_fe.study.types import COMPONENTS
 
 LEGACY = b"# vtk DataFile"
@@ -60,7 +60,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         with tempfile.NamedTemporaryFile(suffix=".vtk" if raw.startswith(LEGACY) else ".vtu") as at:
             at.write(raw)
             at.flush()
-            mesh = untrusted.read_mesh(Path(at.name))
+            mesh = untrusted_files.read_mesh(Path(at.name))
         points = np.asarray(mesh.points, dtype=float)
         vectors: dict[str, Floats] = {
             name: np.asarray(values, dtype=float) for name, values in mesh.point_data.items()

@@ -64,7 +64,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints, of_length, slices
 from halbach_fe.core.errors import HalbachError
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.progress import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of

@@ -4,8 +4,8 @@ A map records the nominal points, where the probe should have been. A fault of p
 the field is read at another point, while the recorded point stays the nominal one.
 
 The instrument that a study states makes a map, too. That is written from the words of
-`halbach_fe.study.measurement.Instrument` and shares no formula with
-`halbach_fe.measurement.instrument`, which corrects a map for it.
+`halbach_fe.study.measurement_keys.Instrument` and shares no formula with
+`halbach_fe.measurement.probe_law`, which corrects a map for it.
 
 Gross errors are a wrong magnet or place of measurement, and a wrongly recorded map.
 """
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.positions import motion
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.measurement_keys import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     METRES,
