@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import in_a_row
+from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
@@ -48,7 +49,7 @@ from halbach_fe.response.multipoles import (
     plain,
     text_table,
 )
-from halbach_fe.study.model import Study
+from halbach_fe.study.model import Study, iron_of
 
 MultipoleTable = tuple[MultipoleModel, Mapping[str, Multipoles]]
 """A reference (circle or integral along z), and the multipoles there of magnets by name."""
@@ -79,7 +80,12 @@ def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) 
     """
     units = (f"m{model.unit}, as there is no main multipole" if absolute else
              "units of 1e-4 of the main multipole")
-    own = [model.main + count for count in study.array.blocks_by_ring]
+    # M blocks make orders N + k M and, if circles are in short rings or materials answer, k M - N
+    local = not model.integrated and model.z is not None
+    answers = iron_of(study) is not None or any(
+        block.is_permeable for block in nominal_blocks(study.array, study.dimension))
+    own = [count + (-1 if local or answers else 1) * model.main
+           for count in study.array.blocks_by_ring]
     higher = "" if study.array.free_blocks or min(own) <= max(model.orders) else (
         f" The lowest unwanted order of rings as designed is {min(own)}, not in the table.")
     uniform = "" if not any(model.left_out_T) else (

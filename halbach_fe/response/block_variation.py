@@ -97,14 +97,15 @@ class Variations:
                 f"at least {least:.2g} m for blocks of {side:.2g} m",
                 f"{prior.variation_length_m:g}", "Shorter variations have no field in the bore."))
         return cls._of_blocks(tuple(magnet.blocks), prior.variation_sd, prior.variation_length_m,
-                              per_side)
+                              per_side, magnet.middle_m)
 
     @classmethod
     @lru_cache(maxsize=2)  # every map of a campaign asks for those of the same blocks
     def _of_blocks(
-        cls, blocks: tuple[MagnetBlock, ...], sd: float, length_m: float, per_side: int
+        cls, blocks: tuple[MagnetBlock, ...], sd: float, length_m: float, per_side: int,
+        middle_m: tuple[float, float, float],
     ) -> Variations:
-        """Return the variations of blocks with ``per_side`` cells along a side."""
+        """Return the variations of blocks about a middle, with ``per_side`` cells along a side."""
         cells = cells_of(blocks, per_side)
         starts = np.searchsorted(cells.block, np.arange(len(blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
@@ -116,7 +117,7 @@ class Variations:
             flat = places.reshape(-1, 3)
             easy = block.polarization
             own = Interaction(_select_cells(cells, mine))
-            effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
+            effect = (own.readings(_cylinder(flat, middle_m)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
             spread = sd**2 * np.exp(-distance / (2 * length_m**2)) @ effect.T
             # the singular vectors of the effect, weighted by the prior, by its Gram matrix, which
@@ -183,10 +184,13 @@ def _select_cells(cells: Cells, chosen: slice) -> Cells:
         "block", "centre", "axes", "vertices", "half", "cuboid")})
 
 
-def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
-    """Return points (n, 3) in m in the bore near a block whose parts are at places (m, 3) in m."""
-    radius = radii_of(places)
-    angle = np.arctan2(*(places.mean(axis=0)[[1, 0]]))
+def _cylinder(places: Floats, middle_m: tuple[float, float, float]) -> Floats:
+    """Return points (n, 3) in m in the bore near a block whose parts are at places (m, 3) in m, of
+    a cylinder along z about a middle.
+    """
+    axis = np.array([*middle_m[:2], 0.0])
+    radius = radii_of(places - axis)
+    angle = np.arctan2(*(places.mean(axis=0) - axis)[[1, 0]])
     low, high = places[:, 2].min(), places[:, 2].max()
     reach = (high - low) / 2
     n_around, n_along = 9, 13  # numbers of points of the cylinder about a block and along it
@@ -196,7 +200,8 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     # the axis
     near_wall = 0.8
     near = near_wall * radius.min()
-    return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
+    return np.asarray(axis + np.column_stack([
+        near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()]))
 
 
 def prior_of_blocks(magnet: Magnet) -> Gaussian:

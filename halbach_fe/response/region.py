@@ -19,6 +19,7 @@ from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import MagnetBlock, distance_from_blocks, present_blocks, vector
+from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.types import MAX_LENGTH_M
@@ -327,7 +328,8 @@ class Sampling:
     degree: int
     """Degree of the functions that these resolve, see `Region.points`."""
     unresolved_m: float | None = None
-    """Distance in m at which blocks or iron are too near for the points; None if none are."""
+    """Distance in m at which blocks, iron or coils are too near for the points; None if none are.
+    """
     inner_radius: float = 1.0
     """Radius of the first points relative to that of the region: less than 1 if they are on a
     sphere within it, because blocks are too near for those on the surface."""
@@ -339,9 +341,9 @@ class Sampling:
         """Say that the extremes may lie between the points, or nothing."""
         if self.unresolved_m is None:
             return ""
-        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks or iron, "
-                "nearer than its points resolve: the true peak to peak may be larger than what is "
-                "said.")
+        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks, iron or "
+                "coils, nearer than its points resolve: the true peak to peak may be larger than "
+                "what is said.")
 
 
 def region_points(
@@ -403,8 +405,9 @@ def _resolved(
     axes, spacing = np.array(region.half_axes_m), base.steps[0] * region.half_axes_m
     # of no cell that is halved the middle is farther from the blocks
     far = 2 * float(axes.max()) / NEAR_SHARE
+    external = magnet.external
     blocks = (*present_blocks(magnet.blocks), *neighbour_blocks(
-        magnet.blocks, magnet.external.neighbours), *shims)
+        magnet.blocks, external.neighbours), *shims)
     # distance up to which points are added, as if blocks that are nearer were so far away
     least = 1e-3 * magnet.bore_radius
 
@@ -412,7 +415,10 @@ def _resolved(
 
     def clearance(points: Floats) -> Floats:
         return np.min([distance_from_blocks(blocks, points, far),
-                       *(body.distance(points) for body in magnet.iron)], axis=0)
+                       *(body.distance(points) for body in magnet.iron),
+                       *(distance_in_magnet(coil, points) for coil in external.coils),
+                       *(np.linalg.norm(points - one.position_m, axis=1)
+                         for one in external.dipoles)], axis=0)
 
     def distance(points: Floats) -> Floats:
         near = np.maximum(clearance(points), least)

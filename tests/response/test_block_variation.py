@@ -127,6 +127,31 @@ def test_a_varying_block_is_inferred(magnet, generator, tmp_path):
     assert result.by_block(result.posterior.mean).shape == (4, 3)
 
 
+@pytest.mark.filterwarnings("ignore:.*lie around an axis at x")
+def test_variations_of_a_magnet_beside_the_axis():
+    """They are those of the magnet on the z axis: modes are told apart by the field in its bore."""
+    angle = 2 * np.pi * np.arange(8) / 8
+
+    def fields(x_m):
+        magnet = build_magnet(parse_study({
+            "name": "beside", "dimension": 3, "mesh": {"block_size_m": 0.01},
+            "prior": {"variation_sd": 0.01, "variation_length_m": 0.008},
+            "array": {"free_blocks": {
+                "name": [f"b{number}" for number in range(8)], "shape": ["cuboid"] * 8,
+                "x_m": (0.05 * np.cos(angle) + x_m).tolist(),
+                "y_m": (0.05 * np.sin(angle)).tolist(), "z_m": [0.0] * 8,
+                **{f"size_{axis}_m": [0.02] * 8 for axis in "xyz"},
+                "rotation_z_deg": np.degrees(angle).tolist(),
+                "remanence_x_T": (1.3 * np.cos(2 * angle)).tolist(),
+                "remanence_y_T": (1.3 * np.sin(2 * angle)).tolist(), "remanence_z_T": [0.0] * 8}},
+            "observation": {"quantity": "flux_density", "positions": {
+                "kind": "points", "points_m": [[x_m, 0.0, 0.0]]}}}))
+        found = Variations.of(magnet).fields(np.array([[x_m + 0.03, 0.0, 0.0]]))
+        return np.linalg.norm(found, axis=2)
+
+    np.testing.assert_allclose(fields(0.3), fields(0.0), rtol=1e-6)
+
+
 def test_too_fine_variations_are_refused(magnet):
     fine = magnet.with_(prior__variation_length_m=1e-3)
     with pytest.raises(StudyError, match=r"at least 0\.0017 m"):  # 1.7 parts of 12 mm / 12

@@ -16,7 +16,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import halbach_ring, magnet_of_blocks
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.multipoles_page import answer, middle_circle
+from halbach_fe.report.multipoles_page import answer, middle_circle, reference_text
 from halbach_fe.response import multipoles
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
@@ -137,6 +137,27 @@ TURNED = {
     "inner_radius_m": [None, 0.04], "outer_radius_m": [None, 0.06], "angle_deg": [None, 50.0],
     "remanence_x_T": [1.0, -0.2], "remanence_y_T": [0.5, 0.7], "remanence_z_T": [0.3, 0.4],
     "rotation_x_deg": [30.0, 10.0], "rotation_y_deg": [20.0, 0.0], "rotation_z_deg": [0.0, 200.0]}
+
+
+def test_the_lowest_order_that_a_ring_as_designed_makes(session):
+    """12 blocks of a dipole make order 11 on circles of a short ring, order 13 alone in a
+    cross-section; what answers to them makes order 11 there too.
+    """
+    flat = study_of()
+    short = parse_study(changed(
+        DIPOLE, dimension=3, array__recoil_permeability=1.0, array__blocks_per_ring=12,
+        array__ring_length_m=0.02, array__rings=1))
+    angle = 2 * np.pi * np.arange(200) / 200
+    points = 0.06 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    circle, plane = MultipoleReference(0.06, ORDERS, 0.0), MultipoleReference(0.06, ORDERS)
+    for study, reference, lowest in ((short, circle, 11), (flat, plane, 13)):
+        field = vacuum_field(magnet_of(study).bodies, points)
+        radial = np.abs(np.fft.rfft(np.sum(field * points, axis=1)))
+        assert np.flatnonzero(radial[2:] > 1e-6 * radial[1])[0] + 2 == lowest
+        model = multipole_model(build_magnet(study), reference, session)
+        assert f"of rings as designed is {lowest}," in reference_text(model, study)
+    permeable = flat.with_(array__recoil_permeability=1.1)
+    assert "of rings as designed is 11," in reference_text(model, permeable)
 
 
 @pytest.mark.parametrize("table", [ALONE, TURNED], ids=["one cube", "turned in space"])
