@@ -19,7 +19,7 @@ than it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import block_diag, solve_triangular
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.blocks import distance_from_blocks, present_blocks
@@ -208,22 +208,53 @@ def _fitted(
     homogeneity, there is none, and no noise if no reading is near enough.
     """
     observation, region = readings.observation, model.region
-    centre = np.array(region.centre_m)
-    near = _is_near(observation.points, region, free_m)
-    near_m = 1e3 * WITHIN * free_m
-    operator = observation.operator.tocsr()
     # a reading counts if all its sensors are near
-    far = np.asarray(abs(operator) @ np.repeat(~near, 3).astype(float)).ravel() > 0
-    used = np.flatnonzero(chosen & ~far)
+    far = ~np.repeat(_is_near(observation.points, region, free_m), 3)
+    used = np.flatnonzero(chosen & ~(abs(observation.operator) @ far.astype(float) > 0))
+    within = f"within {1e3 * WITHIN * free_m:.3g} mm of the region's centre"
     if not len(used):
-        return None, np.nan, (f"has no readings within {near_m:.3g} mm of the "
-                              "region's centre, where blocks and iron leave room for a fit: it "
-                              "does not tell how homogeneous the field is.")
-    operator, sd = operator[used], readings.noise.sd[used]
+        return None, np.nan, (f"has no readings {within}, where blocks and iron leave room for a "
+                              "fit: it does not tell how homogeneous the field is.")
+    centre = np.array(region.centre_m)
+
+    def harmonics(at: Floats) -> Floats:
+        return _fields((at - centre) / free_m)
+
+    amplitudes, noise = _amplitudes(readings, used, harmonics, maps, study)
+    if amplitudes is None:
+        return None, np.nan, (
+            f"has {len(used)} readings {within}. A fit goes through all of them, so that it shows "
+            "neither its noise nor its error: it does not tell how homogeneous the field is. "
+            "Measure more points there.")
+    points = model.points[:len(model.weights)]
+    fields = (harmonics(points) @ amplitudes).reshape(len(points), 3, -1)
+    if observation.of_total_field[used].all():
+        known, fields, remark = _along_nominal(model, fields)
+    else:
+        known, remark = _along_measured(model, fields, _told(observation.operator.tocsr()[used]))
+    if known is None:
+        return None, noise, remark
+    # numbers of such a fit are those of the prior of its amplitudes, and may be far from the truth
+    if PPM * _open(fields[..., 1:], known.direction, model.weights) > (
+            OPEN * known.rms_ppm * known.mean_T):
+        return None, noise, (
+            f"has {len(used)} readings {within}, too few or too noisy ones for the field in the "
+            "region: it does not tell how homogeneous it is.")
+    return known, noise, remark
+
+
+def _amplitudes(
+    readings: Readings, used: Ints, harmonics: Callable[[Floats], Floats], maps: Sequence[Map],
+    study: Study,
+) -> tuple[Floats | None, float]:
+    """Return the fitted amplitudes of harmonics, and draws of them (amplitudes, 1 + draws), and the
+    noise over the stated noise; no amplitudes if they go through all readings that are used.
+    """
+    operator, sd = readings.observation.operator.tocsr()[used], readings.noise.sd[used]
     seen = np.unique(operator.indices // 3)
     columns = (3 * seen[:, None] + np.arange(3)).ravel()
-    design = np.asarray(operator[:, columns] @ _fields(
-        (observation.points[seen] - centre) / free_m)) / sd[:, None]
+    design = np.asarray(operator[:, columns] @ harmonics(
+        readings.observation.points[seen])) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
     # Harmonics that are determined, as a share of the readings, above which the fit goes through
@@ -231,55 +262,55 @@ def _fitted(
     # whose bars were right had 0.88.
     through = 0.95
     if fit.used > through * len(scaled):
-        return None, np.nan, (
-            f"has {len(scaled)} readings within {near_m:.3g} mm of the region's centre. A fit goes "
-            "through all of them, so that it shows neither its noise nor its error: it does not "
-            "tell how homogeneous the field is. Measure more points there.")
-    terms = open_columns(study, lambda at: (
-        _fields((at - centre) / free_m) @ fit.amplitudes).reshape(-1, 3), maps, readings)[
-            used] / sd[:, None]
+        return None, np.nan
+    terms = open_columns(study, lambda at: (harmonics(at) @ fit.amplitudes).reshape(-1, 3), maps,
+                         readings)[used] / sd[:, None]
     mean, noise, root = _with_terms(design, terms, scaled, fit)
     normals = np.random.default_rng(0).standard_normal((root.shape[1], DRAWS))
-    every = np.column_stack([mean, mean[:, None] + root @ normals])
-    points = (model.points[:len(model.weights)] - centre) / free_m
-    told, main = _told(operator), model.nominal_mean
-    fields, lacking = (_fields(points) @ every).reshape(len(points), 3, -1), _lacking(told)
-    remark, nominal = "", model.field(model.response.nominal[:, None])[..., 0]
-    if observation.of_total_field[used].all():
-        along, lacking = unit_vectors(nominal), ""
-        told = along[:, :, None] * along[:, None]
-        differs = _differs(np.sum(along * fields[..., 0], axis=1),
-                           np.linalg.norm(nominal, axis=1), model.weights)
-        if differs > ALONG:
-            return None, noise, (
-                f"is of |B|, which differs by up to {100 * differs:.2g} % from the nominal one in "
-                "the region: the field may turn too much there for |B| to be harmonic. Measure "
-                "components.")
-        remark = ("is of |B|, fitted as B along the nominal field. "
-                  f"{_to_first_order(np.array([np.sqrt(2) * differs]))}")
-    part = None if remark else told
-    if part is None:
-        fields = told @ fields
-    elif np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
-        return None, noise, (f"has no {lacking}, along which much of the main field is: it does "
-                             "not tell how homogeneous |B| is.")
+    return np.column_stack([mean, mean[:, None] + root @ normals]), noise
+
+
+def _along_nominal(
+    model: HomogeneityModel, fields: Floats
+) -> tuple[Homogeneity | None, Floats, str]:
+    """Return the homogeneity of |B| by the part along the nominal field of fields (n, 3, draws) in
+    T, this part, and the end of a sentence on that; no homogeneity if the field turns too much.
+    """
+    nominal = model.field(model.response.nominal[:, None])[..., 0]
+    along = unit_vectors(nominal)
+    differs = _differs(np.sum(along * fields[..., 0], axis=1), np.linalg.norm(nominal, axis=1),
+                       model.weights)
+    if differs > ALONG:
+        return None, fields, (
+            f"is of |B|, which differs by up to {100 * differs:.2g} % from the nominal one in the "
+            "region: the field may turn too much there for |B| to be harmonic. Measure components.")
+    fields = (along[:, :, None] * along[:, None]) @ fields
+    known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True)
+    return replace(known, components="|B|"), fields, (
+        "is of |B|, fitted as B along the nominal field. "
+        f"{_to_first_order(np.array([np.sqrt(2) * differs]))}")
+
+
+def _along_measured(
+    model: HomogeneityModel, fields: Floats, told: Floats
+) -> tuple[Homogeneity | None, str]:
+    """Return the homogeneity of |B| by fields (n, 3, draws) in T, which are told in the directions
+    of a projector (3, 3), and the end of a sentence on what is not; none if much of B is not.
+    """
+    lacking, main = _lacking(told), model.nominal_mean
+    if np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
+        return None, (f"has no {lacking}, along which much of the main field is: it does not tell "
+                      "how homogeneous |B| is.")
     known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True,
-                            told=part if lacking else None)
-    # numbers of such a fit are those of the prior of its amplitudes, and may be far from the truth
-    if PPM * _open(fields[..., 1:], known.direction, model.weights) > (
-            OPEN * known.rms_ppm * known.mean_T):
-        return None, noise, (
-            f"has {len(scaled)} readings within {near_m:.3g} mm of the region's centre, too few or "
-            "too noisy ones for the field in the region: it does not tell how homogeneous it is.")
-    if remark:
-        return replace(known, components="|B|"), noise, remark
+                            told=told if lacking else None)
     if not lacking:
-        return known, noise, ""
+        return known, ""
     has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
+    nominal = model.field(model.response.nominal[:, None])[..., 0]
     size, whole = (np.linalg.norm(each, axis=1) for each in (nominal @ told, nominal))
     across = np.sqrt(np.maximum(whole**2 / size**2 - 1, 0.0))
     differs = _differs(np.linalg.norm(fields[..., 0] @ told, axis=1), size, model.weights)
-    return replace(known, components=has), noise, (
+    return replace(known, components=has), (
         f"has no {lacking}. What is said of it is the size of {has} alone, as the main field is "
         f"along it. {_to_first_order(across + np.sqrt(2) * differs)}")
 

@@ -234,9 +234,10 @@ def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, A
                                        campaign.readings)
     if found.position_noise:  # `own_factors` do not know of it, and count it as evidence
         for name in best.keys() - {one.hypothesis.effect.name for one in found.identified}:
-            best[name] = factor_of(found.after, found.study, readings, simulate_campaign(
-                study, case.seed, hide=[(CAN_BE_HIDDEN[other], values)
-                                        for other, values in case.faults if other != name]).readings)
+            others = [(CAN_BE_HIDDEN[other], values) for other, values in case.faults
+                      if other != name]
+            best[name] = factor_of(found.after, found.study, readings,
+                                   simulate_campaign(study, case.seed, hide=others).readings)
     result = {"case": case.name, "magnet": study.name, "hidden": list(case.hidden),
               "outside": case.outside, "with_blocks": case.with_blocks,
               "labels": labels_of(study, case.faults), "truth": campaign.truth["effects"],
