@@ -439,16 +439,19 @@ def _means(result: dict[str, Any], name: str, number: int) -> bool:
 
     Gross errors, which come first, have none.
     """
+    identified, labels = result.get("identified", []), result.get("labels", {})
+    first = number - (len(result["named"]) - len(identified))
+    there = [] if first < 0 else [
+        (identified[first]["effect"], identified[first]["place"]), *identified[first]["others"]]
+    if name == "ring_gap" and any(
+            effect == LAST_RING and place in labels.get(LAST_RING, ()) for effect, place in there):
+        return True
     if not set(known_as(name)) & set(result["named"][number]):
         return False
-    identified = result.get("identified", [])
-    number -= len(result["named"]) - len(identified)
-    labels = result.get("labels", {}).get(name)
-    if number < 0 or not labels:
+    if first < 0 or not labels.get(name):
         return True
-    one = identified[number]
-    return any(all(label in place for label in labels) for effect, place in (
-        (one["effect"], one["place"]), *one["others"]) if effect in known_as(name))
+    return any(all(label in place for label in labels[name])
+               for effect, place in there if effect in known_as(name))
 
 
 def yes_beside_wrong(result: dict[str, Any]) -> bool:
@@ -485,7 +488,13 @@ def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
         ring = given.get("seam", given.get("ring"))
         if ring is not None and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
             found[effect] = [f"r{ring:02.0f}"]
+        if given.get("seam") == max(number for number, _ in names) - 1:
+            found.setdefault(LAST_RING, [f"r{ring + 1:02.0f}"])
     return found
+
+
+LAST_RING = "ring_shifted_along"
+"""What a gap below the last ring is: this ring is displaced along z, and no other."""
 
 
 LIKE_HIDDEN = (

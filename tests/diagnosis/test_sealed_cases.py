@@ -173,6 +173,13 @@ def test_a_gap_is_compared_with_that_at_its_seam(study):
     assert study.wrong(one) == 0
     # the control: where the gap is at another seam, so is its name
     assert study.wrong(one | {"labels": labels | {"ring_gap": ["r03"]}}) == 1
+    # a gap below the last ring is that ring's displacement; of the control, another ring's is not
+    rings = len({block.ring for block in study.build_magnet(magnet).blocks})
+    last = study.labels_of(magnet, [("ring_gap", (rings - 1.0, 2e-4))])
+    for ring, count in ((rings, 0), (rings - 1, 1)):
+        assert study.wrong(result(["ring_gap"], [["ring_shifted_along"]]) | {
+            "labels": last, "identified": [identified(
+                "ring_shifted_along", f"r{ring:02d}", [2e-4], [1e-5])]}) == count
     # rings beside the seam that are shifted widen it; of the control, ring 3, they do not
     for ring, z, expected in ((1.0, -4e-5, -1.0), (2.0, 4e-5, -1.0), (3.0, 4e-5, 1.0)):
         shifted = {"name": "ring_shifted_along", "parameters": [
