@@ -17,7 +17,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, refined, verify
-from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.azimuthal_modes import solve_modes
 from halbach_fe.solver.getdp import find_getdp

@@ -307,7 +307,7 @@ def response(study: Path) -> dict[str, float]:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.observation_operator import observe
     from halbach_fe.measurement.positions import points_from
-    from halbach_fe.response.matrix import response_matrix
+    from halbach_fe.response.response_matrix import response_matrix
     from halbach_fe.solver.getdp import find_getdp
     from halbach_fe.solver.session import Session
     from halbach_fe.study.reader import read_study

@@ -623,9 +623,9 @@ def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
 def _is_of_a_run(path: Path) -> bool:
     """Tell by its content whether a file without a record is one that a run keeps for later ones.
 
-    Functions below the interface, such as `halbach_fe.response.matrix.response_matrix`, leave no
-    record in a session's folder, and earlier versions left none at all. Somebody's own mesh.msh has
-    no regions.json with these keys beside it.
+    Functions below the interface, such as `halbach_fe.response.response_matrix.response_matrix`,
+    leave no record in a session's folder, and earlier versions left none at all. Somebody's own
+    mesh.msh has no regions.json with these keys beside it.
     """
     if fnmatch(path.name, "response-*.npy"):  # a part of the response beside it
         path = path.with_name("response.h5")

@@ -42,8 +42,8 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.probe_law import seen, sensor_matrix, sensor_positions
 from halbach_fe.response.block_variation import neighbour_prior, study_prior, with_variations
 from halbach_fe.response.homogeneity import homogeneity_model
-from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.region import Region, default_region, region_points
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian

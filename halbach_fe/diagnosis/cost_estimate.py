@@ -14,7 +14,7 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Place
-from halbach_fe.diagnosis.effects.blocks import SHORTLIST, AssemblyEffect
+from halbach_fe.diagnosis.effects.magnetization import SHORTLIST, AssemblyEffect
 from halbach_fe.diagnosis.gross_error_correction import (
     MIN_MISFIT_OF_A_POSE,
     blocks_of,
@@ -56,7 +56,7 @@ class DiagnosisEstimate:
         """Time in s of `FEWEST_ROUNDS`.
 
         By azimuthal modes, a second round of nearly the same shapes and materials takes the
-        solutions of the first one, see `halbach_fe.response.matrix.response_matrix`.
+        solutions of the first one, see `halbach_fe.response.response_matrix.response_matrix`.
         """
         solved = 1 if self.update.route == "azimuthal_modes" else FEWEST_ROUNDS
         return solved * self.update.seconds + self.fields_s

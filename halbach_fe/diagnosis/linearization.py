@@ -13,7 +13,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints, rms
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
-from halbach_fe.diagnosis.effects.blocks import AssemblyEffect, BlockMissingEffect
+from halbach_fe.diagnosis.effects.magnetization import AssemblyEffect, BlockMissingEffect
 from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.nominal_fields import NominalFields

@@ -31,8 +31,8 @@ from halbach_fe.diagnosis.effect_selection import (
     WIDE_PRIOR_SD,
 )
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Parameter, each_block
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
-from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
+from halbach_fe.diagnosis.effects.magnetization import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.places_and_shapes import BLOCK_DISPLACED
 from halbach_fe.diagnosis.linearization import Training, apply_effects
 from halbach_fe.diagnosis.result import DetectionLimits, IdentifiedEffect
 from halbach_fe.diagnosis.scanned_maps import Campaign

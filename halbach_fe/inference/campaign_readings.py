@@ -62,7 +62,7 @@ from halbach_fe.measurement.probe_law import (
     total_without_nonlinear_part,
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
-from halbach_fe.response.matrix import Response, StoredMatrix
+from halbach_fe.response.response_matrix import Response, StoredMatrix
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance

@@ -61,8 +61,8 @@ from halbach_fe.response.block_variation import (
     updated_field,
     with_magnetizations,
 )
-from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.routes import choose_route, field_function
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import posteriors
@@ -121,7 +121,7 @@ def infer(
         estimated, or |B| was read.
     similar : Magnet, optional
         A slightly different magnet that was solved for before, see
-        `halbach_fe.response.matrix.response_matrix`. It saves most of the time.
+        `halbach_fe.response.response_matrix.response_matrix`. It saves most of the time.
 
     Returns
     -------

@@ -48,7 +48,7 @@ from halbach_fe.measurement.probe_law import (
     with_terms,
 )
 from halbach_fe.response.block_variation import STEP
-from halbach_fe.response.matrix import Response
+from halbach_fe.response.response_matrix import Response
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, NoiseCovariance, root_matrix
 from halbach_fe.stats.posteriors import Rows, predict
 from halbach_fe.study.inference_keys import shifted

@@ -42,7 +42,7 @@ from halbach_fe.measurement.doubted_terms import (
 )
 from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.response.magnetic_axis import MagneticAxis
-from halbach_fe.response.matrix import Response
+from halbach_fe.response.response_matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian, NoiseCovariance
 from halbach_fe.stats.posteriors import contraction, row_slices, whitened

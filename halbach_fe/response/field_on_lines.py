@@ -37,7 +37,7 @@ from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation_operator import flux_density_at
 from halbach_fe.response.block_variation import neighbour_remanences
 from halbach_fe.response.discretization_error import reading_errors
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import IronReaction, excess_of
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.iron_bodies import BodiesReaction

@@ -28,8 +28,8 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.source_free_field import solid_harmonic_fields
-from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.region import SHOWN_DEGREES, Region, Sampling, region_points, sphere_points
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement_keys import FluxDensity, Instrument, PointPositions

@@ -14,8 +14,9 @@ squares. Its point in the middle along z, `Magnet.middle_z_m`, is the centre of 
 vanishes: that is where a homogeneous magnet is most homogeneous. It is a saddle point, since the
 component is harmonic. The axis of a dipole is not defined.
 
-The field is linear in the magnetizations, as in `halbach_fe.response.matrix`: permeable blocks and
-iron answer to deviations too. (Of an iron tube close to the blocks, that is a quarter of a roll.)
+The field is linear in the magnetizations, as in `halbach_fe.response.response_matrix`: permeable
+blocks and iron answer to deviations too. (Of an iron tube close to the blocks, that is a quarter of
+a roll.)
 With non-linear iron the field is that of the updated magnet, which is solved for, and standard
 deviations are those of the blocks in vacuum: columns of all blocks take as long as an update.
 """
@@ -39,8 +40,8 @@ from halbach_fe.response.block_variation import (
     neighbour_columns,
     updated_field,
 )
-from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian

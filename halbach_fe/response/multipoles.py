@@ -51,7 +51,7 @@ from halbach_fe.response.block_variation import (
     neighbour_columns,
     neighbour_remanences,
 )
-from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
+from halbach_fe.response.response_matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values

@@ -40,7 +40,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.response.block_variation import prior_of_blocks
 from halbach_fe.response.discretization_error import reading_errors
-from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.getdp_files import check_difference, factorize
 from halbach_fe.solver.interpolation import locate, quadrature
@@ -73,7 +73,7 @@ class NonlinearModel:
     offset: Floats
     """Readings of external fields. Shape (readings,), in T."""
     parameters: tuple[str, ...]
-    """Names of the parameters, as in `halbach_fe.response.matrix.Response`."""
+    """Names of the parameters, as in `halbach_fe.response.response_matrix.Response`."""
     nominal: Floats
     """The study's nominal magnetization. Shape (parameters,), in A/m."""
     error: Floats

@@ -34,7 +34,7 @@ from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation_operator import Observation
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, variants_to_compare
-from halbach_fe.response.matrix import LOADED_BYTES
+from halbach_fe.response.response_matrix import LOADED_BYTES
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of

@@ -37,8 +37,8 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.page import write_files
 from halbach_fe.response.block_variation import with_magnetizations
-from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import posteriors

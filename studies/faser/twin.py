@@ -25,7 +25,7 @@ from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.report.inference_page import page
 from halbach_fe.report.page import write_files
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.posteriors import predict
 from halbach_fe.study.measurement_keys import FluxDensity, PointPositions

@@ -26,7 +26,7 @@ from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_files
 from halbach_fe.report.plan_page import page, plan_summary
-from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.routes import choose_route
 from halbach_fe.solver.session import Session

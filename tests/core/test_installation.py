@@ -61,7 +61,8 @@ def test_only_what_is_imported_counts(toy, changed, matters):
 
 
 def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
-    names = {f"{path.parent.name}/{path.name}" for path in sources("halbach_fe.response.matrix")}
+    names = {f"{path.parent.name}/{path.name}"
+             for path in sources("halbach_fe.response.response_matrix")}
     assert {"geo/magnet_meshes.py", "pro/azimuthal_modes.pro", "pro/case.pro.j2",
             "stats/posteriors.py", "solver/exact_block_field.py"} <= names
     assert not any(name.startswith(("report/", "cli/", "diagnosis/")) for name in names)
@@ -69,7 +70,7 @@ def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
 
 def test_chains_depend_on_the_sampler_too():
     names = {path.name for path in sources("halbach_fe.inference.mcmc")}
-    assert {"posteriors.py", "nonlinear.py", "matrix.py", "magnetostatics_2d.pro"} <= names
+    assert {"posteriors.py", "nonlinear.py", "response_matrix.py", "magnetostatics_2d.pro"} <= names
 
 
 ORIGINS = {  # what pip wrote of the installation (PEP 610), and the command that adds an extra

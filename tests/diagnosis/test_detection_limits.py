@@ -7,8 +7,8 @@ import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effect_selection import Candidate, log_bayes_factors
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
-from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
+from halbach_fe.diagnosis.effects.magnetization import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.places_and_shapes import BLOCK_DISPLACED
 from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.diagnosis.summary import limits_in_words
 from halbach_fe.diagnosis.uncertain_effects import smallest_amplitude

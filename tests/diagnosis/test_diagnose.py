@@ -19,7 +19,7 @@ from halbach_fe.diagnosis.effect_comparison import possible
 from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Parameter, Place
-from halbach_fe.diagnosis.effects.blocks import BlocksSwappedEffect
+from halbach_fe.diagnosis.effects.magnetization import BlocksSwappedEffect
 from halbach_fe.diagnosis.gross_error_correction import beside_amplitudes
 from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import IdentifiedEffect

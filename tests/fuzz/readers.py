@@ -46,9 +46,9 @@ from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from halbach_fe.measurement.map_join import MapPose, read_joined
 from halbach_fe.report.joint_report import read_campaign
 from halbach_fe.response import matrix as matrix_module
-from halbach_fe.response.matrix import Response, StoredMatrix, _beside
-from halbach_fe.response.matrix import _read as read_response
-from halbach_fe.response.matrix import _write as write_response
+from halbach_fe.response.response_matrix import Response, StoredMatrix, _beside
+from halbach_fe.response.response_matrix import _read as read_response
+from halbach_fe.response.response_matrix import _write as write_response
 from halbach_fe.solver.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
 from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.solver.getdp_files import read_matrix, read_saved, read_solutions, read_unknowns

@@ -17,7 +17,7 @@ from halbach_fe.inference.campaign_readings import read_campaign
 from halbach_fe.measurement.campaign_maps import maps_of
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.solution_page import answer
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.response.solution import solve, study_observation
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.solver.routes import check_points

@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import SymmetryImage, no_symmetry, symmetry_of, unique_points
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.routes import choose_route, finite_element_part
 from tests.conftest import circle
 

@@ -23,8 +23,8 @@ from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.report.point_maps import main_line
 from halbach_fe.response.block_variation import with_magnetizations
-from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.nonlinear import newton_readings
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.exact_block_field import gradient_of
 from halbach_fe.solver.ring_harmonics_2d import (
     SectorMagnetization,

@@ -25,7 +25,7 @@ from halbach_fe.measurement.field_map import field_map, points_of, total_field_m
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.registration_page import sentences
 from halbach_fe.response.block_variation import Deviations
-from halbach_fe.response.matrix import StoredMatrix
+from halbach_fe.response.response_matrix import StoredMatrix
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
@@ -221,7 +221,7 @@ def test_a_matrix_on_the_disk_gives_the_same(generator, session, tmp_path, monke
     """The response of |B| is projected in parts if it does not fit into memory."""
     magnet, data = build_magnet(study_of(2)), total_map(2, 1, generator)
     whole = infer(magnet, data, session)
-    monkeypatch.setattr("halbach_fe.response.matrix.LOADED_BYTES", 1000)
+    monkeypatch.setattr("halbach_fe.response.response_matrix.LOADED_BYTES", 1000)
     other = infer(magnet, data, Session.open(tmp_path / "on-disk"))
     assert isinstance(other.response.matrix, StoredMatrix)
     np.testing.assert_allclose(other.posterior.mean, whole.posterior.mean, rtol=1e-9)

@@ -22,7 +22,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.diagnosis.effects.base import Parameter
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.magnetization import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.summary import amounts
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks

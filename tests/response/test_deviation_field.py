@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.response.block_variation import Deviations
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from tests.conftest import circle
 
 POINTS = np.vstack([circle(0.03, 8, z) for z in (0.0, 0.03, 0.09)])

@@ -18,7 +18,6 @@ from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.multipoles_page import answer, middle_circle, reference_text
 from halbach_fe.response import multipoles
-from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
     UNITS,
     MultipoleReference,
@@ -29,6 +28,7 @@ from halbach_fe.response.multipoles import (
     solved_circles,
     unwanted_orders,
 )
+from halbach_fe.response.response_matrix import Response, response_matrix
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian

@@ -23,13 +23,13 @@ from halbach_fe.measurement.observation_operator import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import nonlinear as engine
 from halbach_fe.response.discretization_error import reading_errors
-from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.nonlinear import (
     AGREEMENT_T,
     NonlinearModel,
     compare_with_newton,
     nonlinear_model,
 )
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     nominal_samples,

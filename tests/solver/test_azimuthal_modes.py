@@ -11,7 +11,7 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.getdp import run

@@ -9,7 +9,7 @@ from halbach_fe.core.errors import GetDPError
 from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes, interpolation
 from halbach_fe.solver.azimuthal_modes import solve_modes
 from halbach_fe.solver.exact_block_field import field_of

@@ -8,7 +8,11 @@ import pytest
 from halbach_fe.core.errors import GetDPError, HalbachWarning, MeshError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
+from halbach_fe.response.response_matrix import (
+    check_superposition,
+    response_matrix,
+    superposition_error,
+)
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.magnetostatics import edge_elements, solve_sources
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field

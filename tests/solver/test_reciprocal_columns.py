@@ -11,8 +11,8 @@ from halbach_fe.core.errors import GetDPError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.resource_estimate import decisive_points
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver import iron_modes, routes
 from halbach_fe.solver.azimuthal_modes import meridian_points, solve_modes
 from halbach_fe.solver.getdp_cache import Cache

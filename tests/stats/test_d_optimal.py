@@ -23,7 +23,7 @@ from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.homogeneity import homogeneity_model
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 

@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation_operator import observe
-from halbach_fe.response.matrix import _key
+from halbach_fe.response.response_matrix import _key
 from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.session import Session
