@@ -16,7 +16,7 @@ MODULES = (
     "solver.exact_block_field", "solver.ring_harmonics_2d",
     "measurement.field_map", "measurement.block_table", "measurement.campaign_maps",
     "measurement.observation_operator",
-    "response.matrix", "inference.infer", "inference.result",
+    "response.response_matrix", "inference.infer", "inference.result",
     "diagnosis.diagnose", "diagnosis.result", "diagnosis.marginal_evidence",
     "diagnosis.effect_selection", "diagnosis.effects.base")
 """Modules documented after the API, in the order of the rooms."""

@@ -503,10 +503,12 @@ def design_rings(
     # the search worked for the component along the main field, at points
     judged = [_judged(catalogue, region, catalogue.rings(one.chosen), session)
               for one in every if not reached or one.ppm < MISSES]
+    strongest = max(judged, key=lambda one: one.mean_T)
     # the reaction that it took for all may have made one stronger than it is
     least = (design.least_field_T or 0.0) * (1 - ROUNDING)
     enough = [one for one in judged if one.mean_T >= least]
-    best = _least(enough, design.objective) if reached and enough else judged[number]
+    best = _least(enough, design.objective) if reached and enough else (
+        strongest if reached else judged[number])
     reached = reached and bool(enough)
     if design.between_radii:
         moved = _judged(catalogue, region, moved_radii(

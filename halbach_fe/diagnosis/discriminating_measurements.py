@@ -445,12 +445,14 @@ def _distance(
     identified: IdentifiedEffect, rival: Hypothesis,
 ) -> float:
     """Return the `distance` of an identified effect from a rival, with the other effects free."""
+    # without refinements: they change how large the effect is, which hardly changes what a
+    # measurement tells
     def of(hypothesis: Hypothesis) -> Floats:
-        return np.vstack([scan.of(hypothesis) for scan in readings])
+        return np.vstack([scan.of(hypothesis) for scan in readings])[
+            :, :len(hypothesis.effect.parameters)]
 
     in_full = identified.hypothesis.effect.applied_in_full
     signature = of(identified.hypothesis)
-    # refinements change how large the effect is, which hardly changes what a measurement tells
     signature = signature @ (np.ones(1) if in_full else identified.values[:signature.shape[1]])
     if rival.effect.is_binary:
         signature = signature - of(rival)[:, 0]

@@ -441,12 +441,13 @@ def have_settled(
     """Tell whether the estimates have converged between two rounds.
 
     They may also take turns with ``earlier`` ones of the same model. The smallest of these is the
-    last then: a larger one hides effects that the map shows.
+    last then, unless it is none at all: a larger one hides effects that the map shows.
     """
     if _are_close(old, new):
         return True
+    before, after = (sum(noise.sd_m for noise in one) for one in (old, new))
     return any(_are_close(one, new) for one in earlier) and (
-        sum(noise.sd_m for noise in old) <= sum(noise.sd_m for noise in new))
+        0.0 < before <= after or not after)
 
 
 def _are_close(old: Sequence[PositionNoise], new: Sequence[PositionNoise]) -> bool:

@@ -86,7 +86,8 @@ def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) 
         block.is_permeable for block in nominal_blocks(study.array, study.dimension))
     own = [count + (-1 if local or answers else 1) * model.main
            for count in study.array.blocks_by_ring]
-    higher = "" if study.array.free_blocks or min(own) <= max(model.orders) else (
+    # bodies of iron make any order
+    higher = "" if study.array.free_blocks or study.iron or min(own) <= max(model.orders) else (
         f" The lowest unwanted order of rings as designed is {min(own)}, not in the table.")
     uniform = "" if not any(model.left_out_T) else (
         " The uniform field external.background_T is left out: its integral along all of z is "

@@ -187,7 +187,8 @@ def _fields(
         nominal = solve_nominal(magnet, points, own.within("nominal"))
         field = updated_field(magnet, uniform, points, own.within("updated"))
         columns = Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
-        columns = np.concatenate([columns, neighbour_columns(magnet, points)], axis=2)
+        columns = np.concatenate([columns, neighbour_columns(
+            magnet, points, own.within("neighbours"))], axis=2)
         # variations inside blocks, and neighbours' blocks
         beside = columns[..., len(uniform):] @ mean[len(uniform):]
         return field + beside, nominal, columns

@@ -328,8 +328,8 @@ class Sampling:
     degree: int
     """Degree of the functions that these resolve, see `Region.points`."""
     unresolved_m: float | None = None
-    """Distance in m at which blocks, iron or coils are too near for the points; None if none are.
-    """
+    """Distance in m at which blocks, iron, coils or dipoles are too near for the points; None if
+    none are."""
     inner_radius: float = 1.0
     """Radius of the first points relative to that of the region: less than 1 if they are on a
     sphere within it, because blocks are too near for those on the surface."""
@@ -341,9 +341,9 @@ class Sampling:
         """Say that the extremes may lie between the points, or nothing."""
         if self.unresolved_m is None:
             return ""
-        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks, iron or "
-                "coils, nearer than its points resolve: the true peak to peak may be larger than "
-                "what is said.")
+        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks, iron, "
+                "coils or dipoles, nearer than its points resolve: the true peak to peak may be "
+                "larger than what is said.")
 
 
 def region_points(

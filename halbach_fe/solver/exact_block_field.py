@@ -662,7 +662,8 @@ def current_elements(coil: AnyCoil, longest: float) -> tuple[Floats, Floats]:
     for share, one in zip(shares, turns, strict=True):
         parts = np.diff(one, axis=0)
         lengths = np.linalg.norm(parts, axis=1)
-        counts = np.maximum(np.ceil(lengths / (piece / turn * lengths.sum())).astype(int), 1)
+        exactly = lengths / (piece / turn * lengths.sum())
+        counts = np.maximum(np.ceil(exactly - 1e-9).astype(int), 1)  # but for rounding
         number = np.repeat(np.arange(len(parts)), counts)
         within = (np.arange(len(number)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5)
         places.append(one[number] + (within / counts[number])[:, None] * parts[number])

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.diagnosis.effects import blocks, catalogue
+from halbach_fe.diagnosis.effects import catalogue, magnetization
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.linearization import amplitude_scale, apply_effects
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -536,6 +536,6 @@ def test_what_is_multiplied_is_known_per_unit_of_what_the_study_says(fraction):
 def test_lists_of_effects_have_each_name_once(monkeypatch, listed):
     """A second effect of a name would take the place of the first. Control: lists as they are."""
     assert catalogue()
-    monkeypatch.setattr(blocks, "EFFECTS", listed(blocks.EFFECTS))
+    monkeypatch.setattr(magnetization, "EFFECTS", listed(magnetization.EFFECTS))
     with pytest.raises(StudyError, match=r"module blocks .* effects with names of their own"):
         catalogue()

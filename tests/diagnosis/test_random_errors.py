@@ -235,6 +235,8 @@ def test_a_study_with_vibration():
     assert have_settled([found], larger, [[], larger])
     assert not have_settled(larger, [found], [[], [found]])
     assert not have_settled([found], [PositionNoise(1.0, 5e-4)], [[], larger])
+    assert have_settled([found], [], [[]])
+    assert not have_settled([], [found], [[], [found]])
 
 
 def test_outliers_and_vibration_belong_to_a_map():

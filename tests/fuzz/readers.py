@@ -45,7 +45,7 @@ from halbach_fe.measurement.formats.import_export import import_map
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from halbach_fe.measurement.map_join import MapPose, read_joined
 from halbach_fe.report.joint_report import read_campaign
-from halbach_fe.response import matrix as matrix_module
+from halbach_fe.response import response_matrix as matrix_module
 from halbach_fe.response.response_matrix import Response, StoredMatrix, _beside
 from halbach_fe.response.response_matrix import _read as read_response
 from halbach_fe.response.response_matrix import _write as write_response

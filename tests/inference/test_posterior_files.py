@@ -17,7 +17,7 @@ from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.posterior_files import disagreement_of, read_posterior, write_inference
 from halbach_fe.inference.result import Reservation
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.response import matrix as matrix_module
+from halbach_fe.response import response_matrix as matrix_module
 from halbach_fe.response.response_matrix import response_matrix
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT

@@ -17,7 +17,7 @@ from halbach_fe.inference.posterior_files import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation_operator import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response import matrix as response_module
+from halbach_fe.response import response_matrix as response_module
 from halbach_fe.response.response_matrix import StoredMatrix, response_matrix
 from halbach_fe.stats import posteriors
 from halbach_fe.stats.gaussian import (
