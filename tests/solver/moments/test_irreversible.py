@@ -248,6 +248,19 @@ def test_losses_count_the_external_field(hot_cube, external):
     assert alone[0] - opposed[0] == pytest.approx(taken, rel=0.06)
 
 
+@pytest.mark.filterwarnings("ignore:.*1200 times the earth")
+def test_iron_far_away_changes_no_losses(hot_cube):
+    """Beside iron of any shape the background counts in full in the heat, as it does without."""
+    block = hot_cube.blocks[0]
+    beside = hot_cube.with_(external__background_T=(-0.06 * np.array(block.easy_axis)).tolist())
+    near_iron = beside.with_(mesh__growth=4.0, mesh__block_size_m=0.006, iron={
+        "relative_permeability": 10.0, "bodies": [
+            {"kind": "box", "size_m": [2e-3] * 3, "centre_m": [0.05, 0.0, 0.0]}]})
+    alone, other = (polarization(solve_separate(magnet, Session.temporary(), False).blocks[0],
+                                 block) for magnet in (beside, near_iron))
+    assert other == pytest.approx(alone, abs=3e-4)  # as Newton ends
+
+
 def test_weak_fields_and_those_that_iron_may_shield_change_no_losses(hot_cube):
     """The earth's field needs no solution of its own. Beside coaxial iron, which does not answer to
     external fields, the losses do not either, as a warning says; without iron there is none.
