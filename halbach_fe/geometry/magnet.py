@@ -157,7 +157,7 @@ class Magnet(ShownInNotebook):
 
     @property
     def has_losses(self) -> bool:
-        """Whether the blocks have lost remanence irreversibly in their own field."""
+        """Whether the blocks have lost remanence irreversibly in the field that they are in."""
         return self.study.demagnetization is not None and self.study.demagnetization.irreversible
 
     @cached_property

@@ -205,6 +205,8 @@ def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) ->
     if magnet.is_vacuum:
         return vacuum
     alone = magnet.with_(external=External())
+    if magnet.has_losses and not magnet.iron:
+        alone = magnet  # what other sources have made it lose is lost without them, too
     # beside iron as for the readings: without other sources that is solved already
     as_readings = bool(magnet.iron)
     reaction = solve_separate(

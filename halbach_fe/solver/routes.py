@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from halbach_fe.core.arrays import Floats, Ints, plain, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import is_cross_section
@@ -42,6 +42,7 @@ from halbach_fe.solver.separate_blocks import (
     applies,
     columns_of_iron,
     external_acts,
+    external_on_losses,
     field_in_vacuum,
     iron_alone,
     separate_columns,
@@ -51,7 +52,6 @@ from halbach_fe.solver.separate_blocks import (
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.study.external_keys import External
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -599,17 +599,10 @@ def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | N
 
 def _external_beside_losses(magnet: Magnet) -> str | None:
     """Return the sentence about an external field that irreversible losses do not count, None
-    without.
+    without: beside iron that does not answer to it.
     """
-    if not magnet.has_losses or magnet.external == External() or external_acts(magnet):
-        return None
-    # of the coercivity: a hundredth of the width of a usual knee, below which losses hardly change
-    weak = 1e-3
-    there = external_field(magnet, np.array([
-        block.mounted_middle for block in present_blocks(magnet.blocks)]))
-    size = float(np.linalg.norm(there, axis=1).max())
-    least = min(each.intrinsic_coercivity_A_per_m for each in magnet.demagnetizations)
-    return None if size < weak * MU_0 * least else (
+    size = external_on_losses(magnet) if magnet.iron and not external_acts(magnet) else 0.0
+    return None if not size else (
         f"The field of `external`, up to {1e3 * size:.3g} mT in the middles of the blocks, is left "
         f"out of the irreversible losses of study {magnet.name}, which may be larger or smaller. "
         "`halbach-fe demagnetization` counts it.")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -44,6 +44,7 @@ from halbach_fe.solver.moments.solve import (
 )
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.external_keys import External
+from halbach_fe.study.materials import MU_0
 
 MANY_BLOCKS = 64
 """Number of blocks from which their field on the iron is summed by expansions."""
@@ -131,7 +132,7 @@ def solve_separate(
     own = _Blocks.of(magnet, 2 if estimate else 1)
     if not magnet.iron:
         return _reaction_without_iron(own)
-    key: tuple[object, ...] = own, magnet.external, key_of(magnet, session, 1.0)
+    key: tuple[object, ...] = own, key_of(magnet, session, 1.0)
     if magnet.iron_is_axisymmetric:  # whose mesh follows from the bodies
         study = magnet.study
         key = own, study.iron_ring, study.iron, magnet.array_half_length, session.getdp
@@ -148,8 +149,7 @@ def _reaction_with_iron(
 ) -> SeparateReaction:
     """Return the reaction of blocks and iron, each in turn in the field of the other."""
     blocks, systems = own.blocks, own.systems()
-    others = partial(external_field, magnet) if external_acts(magnet) else None
-    remanent = _cached_field(_sum_of_fields(field_in_vacuum(blocks), others))
+    remanent = _cached_field(_sum_of_fields(field_in_vacuum(blocks), own.others))
     if not systems:
         return SeparateReaction((), _solve_iron(magnet, remanent, session, estimate))
     iron = _solve_iron(magnet, remanent, session.within("turns"), rough=True)
@@ -166,7 +166,7 @@ def _reaction_with_iron(
     # cubes of 12.7 mm, 4 mm from a tube); that field is some 5 % of the source.
     iron_degree = 8
     for _ in range(most_turns):
-        polarized = own.polarized(systems[0], _sum_of_fields(iron.field, others))
+        polarized = own.polarized(systems[0], iron.field)
         source = _sum_of_fields(remanent, partial(polarized.reaction, degree=iron_degree))
         iron = _solve_iron(magnet, source, session.within("turns"), rough=True, start=iron)
         now = iron.field(middles)
@@ -175,8 +175,7 @@ def _reaction_with_iron(
         # the changes fall as a geometric series, whose rest this is; the first is its own bound
         rest = change if earlier == np.inf else change**2 / max(earlier - change, 1e-300)
         if change < earlier and rest <= tolerance * scale:
-            return own.reaction(
-                systems, _solve_iron(magnet, source, session, estimate), others)
+            return own.reaction(systems, _solve_iron(magnet, source, session, estimate))
     raise HalbachError(
         f"Blocks and iron of study {magnet.name} do not come to rest in {most_turns} turns: the "
         f"last changed the iron's field by {change:.1e} T. Please report this with the study.")
@@ -185,6 +184,21 @@ def _reaction_with_iron(
 def external_acts(magnet: Magnet) -> bool:
     """Tell whether iron and blocks answer to the external field: beside iron of any shape."""
     return not magnet.iron_is_axisymmetric and magnet.external != External()
+
+
+def external_on_losses(magnet: Magnet) -> float:
+    """Return the largest external field in T in the middles of blocks with irreversible losses, 0
+    if it is too weak for them.
+    """
+    if not magnet.has_losses or magnet.external == External():
+        return 0.0
+    # of the coercivity: a hundredth of the width of a usual knee, below which losses hardly change
+    weak = 1e-3
+    there = external_field(magnet, np.array([
+        block.mounted_middle for block in present_blocks(magnet.blocks)]))
+    size = float(np.linalg.norm(there, axis=1).max())
+    least = min(each.intrinsic_coercivity_A_per_m for each in magnet.demagnetizations)
+    return size if size >= weak * MU_0 * least else 0.0
 
 
 def _solve_iron(
@@ -344,6 +358,11 @@ class _Blocks:
     """See `halbach_fe.solver.moments.solve.refinement`."""
     sizes: int
     """Number of sizes of the cells: 2 for error bars."""
+    external: External
+    """Sources outside that the blocks answer to: beside iron of any shape, and if there are losses
+    without iron. Other iron does not answer to them, and may shield the blocks."""
+    magnet: Magnet = field(compare=False)
+    """Whose blocks are those of neighbours."""
 
     @classmethod
     def of(cls, magnet: Magnet, sizes: int) -> _Blocks:
@@ -352,8 +371,19 @@ class _Blocks:
         if magnet.has_losses:
             laws = tuple(KneeLaw.of(material) for block, material in zip(
                 magnet.blocks, magnet.demagnetizations, strict=True) if present_blocks((block,)))
+        acts = external_acts(magnet) or (not magnet.iron and external_on_losses(magnet))
         return cls(present_blocks(magnet.blocks), laws, magnet.study.prior.variation_sd > 0,
-                   magnet.study.mesh.cells_per_side, sizes)
+                   magnet.study.mesh.cells_per_side, sizes,
+                   magnet.external if acts else External(), magnet)
+
+    @property
+    def others(self) -> Field | None:
+        """The field of the external sources, if there are any."""
+        return None if self.external == External() else partial(external_field, self.magnet)
+
+    def _applied(self, iron: Field | None) -> Field | None:
+        """Return the sum of the fields of iron and external sources."""
+        return self.others if iron is None else _sum_of_fields(iron, self.others)
 
     def systems(self) -> tuple[System, ...]:
         """Return the blocks in cells, see `refinement`; none where nothing reacts."""
@@ -363,34 +393,42 @@ class _Blocks:
 
     def reaction(
         self, systems: Sequence[System], iron: IronReaction | BodiesReaction | None = None,
-        others: Field | None = None, known: Sequence[Moments] = (),
+        known: Sequence[Moments] = (),
     ) -> SeparateReaction:
         """Return the reaction of blocks in the field of the iron, with another if there are two
         systems for its error bar.
 
-        ``others`` is an external field that they answer to. ``known`` is the polarization of the
-        first system, if it has been solved.
+        ``known`` is the polarization of the first system, if it has been solved.
         """
-        applied = None if iron is None else _sum_of_fields(iron.field, others)
-        first = known or [self.polarized(system, applied) for system in systems[:1]]
+        of_iron = None if iron is None else iron.field
+        first = known or [self.polarized(system, of_iron) for system in systems[:1]]
         if self.laws is None or len(systems) < 2:
             return SeparateReaction(
-                (*first, *(self.polarized(system, applied) for system in systems[1:])), iron)
-        by_mean = () if self.varies else (self.polarized(systems[0], applied, by_mean=True),)
+                (*first, *(self.polarized(system, of_iron) for system in systems[1:])), iron)
+        by_mean = () if self.varies else (self.polarized(systems[0], of_iron, by_mean=True),)
+        applied = self._applied(of_iron)
         return SeparateReaction((*first, *by_mean), iron,
                                 tuple(system.solve(applied) for system in systems))
 
-    def polarized(self, system: System, applied: Field | None = None,
+    def polarized(self, system: System, iron: Field | None = None,
                   by_mean: bool = False) -> Moments:
-        """Return the polarization of the blocks, less what they have lost irreversibly.
+        """Return the polarization of the blocks in the field of the iron, less what they have lost
+        irreversibly.
 
         ``by_mean`` tells whether to use the mean field of the cells, see `solve_irreversible`.
+        Neighbours are of the same material, and weaken in the heat as the blocks do; what iron
+        answers to other sources is taken to do so, too.
         """
         if self.laws is None:
-            return system.solve(applied)
-        coercivity = np.array([law.coercivity_T for law in self.laws])
-        law = replace(self.laws[0], coercivity_T=coercivity[system.interaction.cells.block])
-        return solve_irreversible(system, law, applied, by_mean=by_mean)[0]
+            return system.solve(self._applied(iron))
+        coercivity, remanence = np.array([
+            (law.coercivity_T, law.remanence_factor) for law in self.laws])[
+                system.interaction.cells.block].T
+        law = replace(self.laws[0], coercivity_T=coercivity, remanence_factor=remanence)
+        steady = None if self.others is None else partial(
+            external_field, self.magnet.with_(external__neighbours=()))
+        return solve_irreversible(system, law, self._applied(iron), by_mean=by_mean,
+                                  steady=steady)[0]
 
 
 @lru_cache(maxsize=2)  # every map of a campaign, and every round of an update, asks for the same

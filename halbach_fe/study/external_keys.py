@@ -117,7 +117,8 @@ class External(StudyModel):
     """Fields of sources outside the magnet, added to its field.
 
     ``background_T`` is uniform. Iron that is no coaxial tube or disc, nor a prism with equal rings,
-    and the blocks beside it answer to external fields. In all other magnets that is neglected.
+    and the blocks beside it answer to external fields, as do blocks with irreversible losses
+    without iron. In all other magnets that is neglected.
     """
 
     background_T: FluxDensityVector = (0.0, 0.0, 0.0)

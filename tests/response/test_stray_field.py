@@ -19,6 +19,8 @@ from halbach_fe.report.homogeneity_page import (
 from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import DISTANCES, NEAREST, _farthest, stray_field
+from halbach_fe.response.stray_field import _field as field_of_magnet
+from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
@@ -232,6 +234,20 @@ def test_coils_are_no_part_of_the_magnet_beside_iron(tmp_path):
     assert stray_title(beside) == "Outside of the magnet, without coils"  # in the terminal too
     assert "coils besides" in str(sections_of_stray(beside)[0].parts)
     assert abs(bare.axial.distance_m / alone.axial.distance_m - 1) > 0.01
+
+
+def test_what_a_neighbour_has_taken_is_lost_without_it():
+    """The field alone is that beside the neighbour less that of the neighbour."""
+    near = build_magnet(parse_study(changed(
+        LONE, external={"neighbours": [{"z_m": 1.2 * CUBE_M, "factor": -1.0}]},
+        demagnetization={"irreversible": True, "intrinsic_coercivity_A_per_m": 6e5,
+                         "remanence_coefficient_per_K": 0.0,
+                         "coercivity_coefficient_per_K": -0.006})))
+    points, session = np.array([[0.1, 0.05, 0.03], [0.16, 0.0, 0.0]]), Session.temporary()
+    alone = field_of_magnet(near, session, None)(points)
+    assert alone == pytest.approx(near.field_T(points) - external_field(near, points), abs=1e-9)
+    intact = near.with_(external={})
+    assert np.abs(alone - intact.field_T(points)).max() > 1e-4
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.1])

@@ -527,6 +527,8 @@ class KneeLaw:
     """mu_0 H_cJ. Shape () or (n,)."""
     squareness: float
     """Ratio of H_k, where a tenth of the remanence is lost, to H_cJ; below 1."""
+    remanence_factor: float | Floats = 1.0
+    """Remanence at the temperature of the losses, relative to that stated. Shape () or (n,)."""
 
     @classmethod
     def of(cls, material: Demagnetization) -> KneeLaw:
@@ -534,13 +536,14 @@ class KneeLaw:
 
         There the blocks are weaker, and so is the field that they are in. The part that is left at
         ``B_r`` with the coercivity ``h_c / (1 + a)`` is that at ``(1 + a) B_r`` with ``h_c``: all
-        fields are as much weaker as the remanence, but for those of other sources.
+        fields are as much weaker as the remanence, but for those of other sources, which
+        `solve_irreversible` divides by ``1 + a``.
         """
         hotter = material.temperature_C - material.reference_temperature_C
         coercivity, remanence = (1 + hotter * each for each in (
             material.coercivity_coefficient_per_K, material.remanence_coefficient_per_K))
         return cls(MU_0 * material.intrinsic_coercivity_A_per_m * coercivity / remanence,
-                   material.squareness)
+                   material.squareness, remanence)
 
     def _at(self, field: Floats) -> tuple[Floats, Floats]:
         """Return the coercivity and the width w in T for fields (n, ...) of the cells."""
@@ -577,7 +580,8 @@ class KneeLaw:
 
 
 def solve_irreversible(
-    system: System, law: KneeLaw, applied: Applied | None = None, *, by_mean: bool = False
+    system: System, law: KneeLaw, applied: Applied | None = None, *, by_mean: bool = False,
+    steady: Applied | None = None,
 ) -> tuple[Moments, Floats]:
     """Return the polarization of blocks that have lost remanence, and the loss.
 
@@ -589,6 +593,8 @@ def solve_irreversible(
         mu_0 H of other sources, such as iron.
     by_mean : bool
         Whether the loss of a cell is that of the mean field in it, which is too small.
+    steady : callable, optional
+        The part of ``applied`` whose sources do not weaken as the blocks do in the heat.
 
     Returns
     -------
@@ -606,7 +612,11 @@ def solve_irreversible(
     strength = np.linalg.norm(system.remanence, axis=1)
     easy = system.remanence / np.where(strength > 0, strength, 1.0)[:, None]
     outer = _at_nodes(applied, cells)
-    outer_along, outer_mean = np.einsum("nqi,ni->nq", outer, easy), cells.mean(outer)
+    outer_mean = cells.mean(outer)
+    # what steady sources have more of in the field that takes remanence, along the easy axis
+    more = np.einsum("nqi,ni->nq", _at_nodes(steady, cells), easy / np.reshape(
+        law.remanence_factor, (-1, 1)) - easy)
+    outer_along = np.einsum("nqi,ni->nq", outer, easy) + more
 
     def kept(along: Floats, polarization: Floats) -> tuple[Floats, Floats]:
         """Return p and dp/dh in 1/T at the nodes (cells, q) in the field along the easy axis."""
@@ -619,7 +629,7 @@ def solve_irreversible(
         """Return the mean field (cells, 3) in T, and the means of p and of dp/dh (cells,)."""
         if field_of is None:
             field = interaction.mean_field(polarization) + outer_mean
-            along = np.einsum("ni,ni->n", field, easy)
+            along = np.einsum("ni,ni->n", field, easy) + np.einsum("nq,nq->n", cells.weights, more)
             return field, law.kept(along), law.slope(along)
         along, field = field_of(polarization)
         part, slope = kept(along + outer_along, polarization)
@@ -629,7 +639,7 @@ def solve_irreversible(
     polarization, part, steps = _uniform(system, strength, easy, state, 0.0 if by_mean else TUBE)
     # the polarization about the nodes differs as the field there does; its means stay
     field = interaction.node_field(polarization) + outer
-    along = np.einsum("nqi,ni->nq", field, easy)
+    along = np.einsum("nqi,ni->nq", field, easy) + more
     at_nodes = law.kept(along) if by_mean else kept(along, polarization)[0]
     by_node = np.einsum("nij,nqj->nqi", chi, field) + (
         strength[:, None] * at_nodes)[..., None] * easy[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import magpylib
@@ -11,8 +12,8 @@ from scipy.optimize import brentq, root
 
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.magnets import magnet_of_blocks
-from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.moments.solve import KneeLaw, System, solve_irreversible
+from halbach_fe.solver.routes import check_points
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0, Demagnetization, grade
@@ -81,12 +82,13 @@ def test_one_cube_in_one_cell_keeps_what_its_own_field_leaves(cube):
     assert lost[0] > 0.1 * cube.remanence  # the law bites
 
 
-def test_cells_agree_with_magpylib(cube):
-    """magpylib's field, averaged over each of 27 cuboids, makes a system that scipy solves."""
+def thirds(middle, easy):
+    """27 equal parts of a cube: the nodes (27, n, 3) in m of each, their weights (n,), and mean
+    mu_0 H along the easy axis in each per polarization of each, by magpylib.
+    """
     steps = SIDE / 3 * np.array([-1, 0, 1])
     places = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    places = places + cube.from_frame(np.zeros((1, 3)))
-    easy = np.array(cube.easy_axis)
+    places = places + middle
     nodes, weights = np.polynomial.legendre.leggauss(6)
     inside = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3) * SIDE / 6
     share = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / 8
@@ -94,6 +96,12 @@ def test_cells_agree_with_magpylib(cube):
                for place in places]
     matrix = MU_0 * np.array([[share @ (source.getH(place + inside) @ easy) for source in sources]
                               for place in places])
+    return places[:, None] + inside, share, matrix
+
+
+def test_cells_agree_with_magpylib(cube):
+    """magpylib's field, averaged over each of 27 cuboids, makes a system that scipy solves."""
+    matrix = thirds(cube.from_frame(np.zeros((1, 3))), np.array(cube.easy_axis))[2]
     found = root(lambda j: cube.remanence * LAW.kept(matrix @ j) + CHI * matrix @ j - j,
                  np.full(27, 0.8 * cube.remanence), tol=1e-12)
     assert found.success
@@ -188,24 +196,86 @@ def test_losses_of_cubes_of_two_grades():
         assert np.abs(both[number] - other[number]).max() > 1e-3
 
 
-def test_losses_that_a_neighbour_would_make_are_named():
-    """One above opposes the cube, and takes a part of it that the field does not know of."""
+@pytest.fixture
+def hot_cube():
+    """A magnet of one cube, which has been at 100 °C."""
     magnet = magnet_of_blocks({
         "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "material": ["N42"],
         **{f"size_{axis}_m": [SIDE] for axis in "xyz"}})
-    magnet = magnet.with_study(magnet.study.with_(array__material="N42", demagnetization=(
-        Demagnetization(**grade("N42").demagnetization_defaults, temperature_C=100.0,
-                        irreversible=True))))
-    point = np.array([[0.0, 2 * SIDE, 0.0]])
-    beside = magnet.with_(external__neighbours=[{"z_m": 1.2 * SIDE}])
-    with pytest.warns(HalbachWarning, match=r"up to 55\.2 mT in the middles .* left out of"):
-        beside.field_T(point)
-    system = System.of(magnet.blocks)
-    law = KneeLaw.of(magnet.demagnetizations[0])
-    alone, opposed = (solve_irreversible(system, law, applied)[1].mean() for applied in (
-        None, lambda places: external_field(beside, places)))
-    assert opposed > 1.5 * alone > 0
-    magnet.with_(external__background_T=(5e-5, 0.0, 0.0)).field_T(point)  # nothing is said of it
+    return magnet.with_study(magnet.study.with_(
+        array__material="N42", mesh__cells_per_side=3, demagnetization=Demagnetization(
+            **grade("N42").demagnetization_defaults, temperature_C=100.0, irreversible=True)))
+
+
+@pytest.mark.filterwarnings("ignore:.*1200 times the earth")
+@pytest.mark.parametrize("external", ["neighbour", "background"])
+def test_losses_count_the_external_field(hot_cube, external):
+    """The mean polarization of a hot cube, whose equations are solved at its temperature: there its
+    remanence and that of a neighbour are lower, but not the field of a background.
+    """
+    block, (material,) = hot_cube.blocks[0], hot_cube.demagnetizations
+    easy, chi = np.array(block.easy_axis), block.recoil_permeability - 1
+    warmer, coercivity = (1 + 80 * each for each in (
+        material.remanence_coefficient_per_K, material.coercivity_coefficient_per_K))
+    law = KneeLaw(MU_0 * coercivity * material.intrinsic_coercivity_A_per_m, material.squareness)
+    nodes, share, matrix = thirds(np.zeros(3), easy)
+    if external == "neighbour":
+        beside = hot_cube.with_(external__neighbours=[{"z_m": 1.2 * SIDE}])
+        other = magpylib.magnet.Cuboid(polarization=block.remanence * easy, dimension=(SIDE,) * 3,
+                                       position=(0, 0, 1.2 * SIDE))
+        field = other.getB(nodes.reshape(-1, 3)).reshape(nodes.shape) @ easy @ share
+        there = warmer * field
+    else:
+        beside = hot_cube.with_(external__background_T=(-0.06 * easy).tolist())
+        field = there = np.full(27, -0.06)
+
+    def mean(there, field):
+        """Mean polarization at 20 °C, where nothing more is lost."""
+        hot = root(lambda j: block.remanence * warmer * law.kept(matrix @ j + there)
+                   + chi * (matrix @ j + there) - j, np.full(27, block.remanence), tol=1e-12)
+        kept = block.remanence * law.kept(matrix @ hot.x + there)
+        return np.linalg.solve(np.eye(27) - chi * matrix, kept + chi * field).mean()
+
+    alone, opposed = ([polarization(each, block) for each in solve_separate(
+        magnet, Session.temporary()).blocks] for magnet in (hot_cube, beside))
+    expected, near = mean(there, field), 3e-3  # without an external field they differ by 1e-3
+    assert opposed[1] == pytest.approx(expected, abs=near)
+    for wrong in (0.0, warmer, 1 / warmer):  # of no heat, or of sources that answer it as others do
+        assert abs(mean(wrong * there, field) - expected) > 2 * near
+    # what the field takes by the law of the nodes, too much by up to 0.05; without heat it is
+    # 0.07 less of the background
+    taken = mean(0 * there, 0 * field) - expected
+    assert alone[0] - opposed[0] == pytest.approx(taken, rel=0.06)
+
+
+@pytest.mark.filterwarnings("ignore:.*1200 times the earth")
+def test_iron_far_away_changes_no_losses(hot_cube):
+    """Beside iron of any shape the background counts in full in the heat, as it does without."""
+    block = hot_cube.blocks[0]
+    beside = hot_cube.with_(external__background_T=(-0.06 * np.array(block.easy_axis)).tolist())
+    near_iron = beside.with_(mesh__growth=4.0, mesh__block_size_m=0.006, iron={
+        "relative_permeability": 10.0, "bodies": [
+            {"kind": "box", "size_m": [2e-3] * 3, "centre_m": [0.05, 0.0, 0.0]}]})
+    alone, other = (polarization(solve_separate(magnet, Session.temporary(), False).blocks[0],
+                                 block) for magnet in (beside, near_iron))
+    assert other == pytest.approx(alone, abs=3e-4)  # as Newton ends
+
+
+def test_weak_fields_and_those_that_iron_may_shield_change_no_losses(hot_cube):
+    """The earth's field needs no solution of its own. Beside coaxial iron, which does not answer to
+    external fields, the losses do not either, as a warning says; without iron there is none.
+    """
+    session, point = Session.temporary(), np.array([[0.0, 2 * SIDE, 0.0]])
+    assert solve_separate(hot_cube.with_(external__background_T=(5e-5, 0.0, 0.0)),
+                          session) is solve_separate(hot_cube, session)
+    beside = hot_cube.with_(external__neighbours=[{"z_m": 1.2 * SIDE}])
+    check_points(beside, point)
+    in_tube = beside.with_(iron_ring={"inner_radius_m": 0.1, "outer_radius_m": 0.11,
+                                      "relative_permeability": 1000.0})
+    with pytest.warns(HalbachWarning) as caught:
+        check_points(in_tube, point)
+    assert re.search(r"up to 55\.2 mT in the middles .* left out of", " ".join(
+        str(each.message) for each in caught))
 
 
 def test_newtons_steps_are_few(cube):
