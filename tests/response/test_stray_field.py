@@ -143,7 +143,7 @@ def test_a_posterior_of_as_many_other_blocks_is_doubted(magnet):
     turned = np.repeat(np.where(np.arange(blocks) < blocks // 4, -1, 1), 3) * nominal
     assert stray_field(magnet, NOT_KEPT, Gaussian(turned, np.eye(len(nominal))))
     for question in (stray_field, magnetic_axis):
-        with pytest.warns(HalbachWarning, match="In `magnetizations` .* of another magnet"):
+        with pytest.warns(HalbachWarning, match="As they were given .* of another magnet"):
             question(magnet, NOT_KEPT, Gaussian(np.roll(nominal, 1), np.eye(len(nominal))))
 
 

@@ -21,11 +21,13 @@ from matplotlib.figure import Figure
 from halbach_fe.cli import main
 from halbach_fe.core.installation import code_digest
 from halbach_fe.report import page
+from halbach_fe.response import response_matrix
 
 IMPORTED = ["halbach_fe.api", "halbach_fe.cli.verbs", "halbach_fe.report.page",
             "matplotlib.pyplot", "scipy.stats", "magpylib", __name__]
 
-code_digest(response_matrix.__name__)  # kept by all processes: to read all sources takes half a second
+# kept by all processes: to read all sources takes half a second
+code_digest(response_matrix.__name__)
 
 FIGURE = Figure(figsize=(1, 1))
 """Every figure of a page: to draw them takes as long as the rest, and tests of pages do so."""
