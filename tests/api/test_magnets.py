@@ -685,7 +685,7 @@ def test_noise_that_a_plan_misses():
 
 
 @pytest.mark.parametrize(("factor", "said", "other"), [
-    (1e3, "in millitesla or gauss.* = 0.001 or 0.0001 .*Bx_mT, .* or Bx_G, ", "kT"),
+    (1e3, "in millitesla or gauss.*Bx_mT, .* or Bx_G, .* = 0.001 or 0.0001 in", "kT"),
     (1e4, "in gauss.* = 0.0001 in", "millitesla")])
 def test_units_that_a_field_may_have(factor, said, other):
     """88 mT and 880 gauss are 88 times 10 too much each; 8800 are gauss."""
