@@ -56,14 +56,14 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "no_root": front.no_root, "speed": speed.run, "speed_small": speed.small,
          "speed_full": speed.full, "speed_permeability": speed.permeability,
          "speed_solvers": speed.solvers, "speed_waiting": speed.waiting,
-         "speed_quadrupole": speed.quadrupole}
+         "speed_quadrupole": speed.quadrupole, "speed_growth": speed.growth}
 ALONE = ("recovery", "recipe", "scaling", "moments", "iron3d", "iron_any", "iron_undulator",
          "iron_times", "iron_columns", "team13", "calibration", "check", "joined", "joined_lacking",
          "overlap", "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
          "design", "mri", "first_field", "no_root", "speed", "speed_small", "speed_full",
          "speed_permeability",
-         "speed_solvers", "speed_waiting", "speed_quadrupole")
+         "speed_solvers", "speed_waiting", "speed_quadrupole", "speed_growth")
 """Parts that are measured only when they are named: they take long."""
 
 

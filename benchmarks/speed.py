@@ -8,6 +8,7 @@ time of a process and its children, which another program on the machine hardly 
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import subprocess
@@ -177,9 +178,7 @@ def waiting(note: Note) -> None:
 
     What is compiled once is compiled before, by both, on the smaller of the tasks.
     """
-    folder = ROOT / "build" / "speed" / "waiting"
-    if not (folder / "check-8892" / "map.csv").exists():
-        run_task("make-waiting", None, folder)
+    folder = _waiting()
     for site in (old_code(BEFORE_WAITING), None):
         for name in ("register", "check-2565"):
             run_task("command", site, folder / name)
@@ -194,6 +193,28 @@ def waiting(note: Note) -> None:
              f"processor time of the code before, commit {BEFORE_WAITING}: "
              f"{old['processor_s']:.3g} s; now {new['processor_s']:.3g} s{answers}; peak memory "
              f"{old['peak_GiB']:.3g} GiB, {new['peak_GiB']:.3g} GiB")
+
+
+def _waiting() -> Path:
+    """Return the folder of the studies and maps of `waiting`, which are made if need be."""
+    folder = ROOT / "build" / "speed" / "waiting"
+    if not (folder / "check-50000" / "map.csv").exists():
+        run_task("make-waiting", None, folder)
+    return folder
+
+
+def growth(note: Note) -> None:
+    """Note with which power of the number of points the time of ``check`` grows."""
+    folder = _waiting()
+    run_task("command", None, folder / "check-2565")  # what is compiled once
+    seconds, points = [], []
+    for name in ("check-2565", "check-50000"):
+        seconds.append(run_task("command", None, folder / name)[0])
+        rows = (folder / name / "map.csv").read_text().splitlines()
+        points.append(sum(not row.startswith("#") for row in rows) - 1)
+    note("check.time_exponent", math.log(seconds[1] / seconds[0]) / math.log(
+        points[1] / points[0]), "exponent", f"processor time of {points[0]} points: "
+         f"{seconds[0]:.3g} s, of {points[1]}: {seconds[1]:.3g} s")
 
 
 def solvers(note: Note) -> None:

@@ -183,7 +183,7 @@ def make_waiting(folder: Path) -> dict[str, float]:
 
     ``register`` has 338 cubes and 833 points of a map that is displaced and turned, and
     ``register-many`` 400 and 4023, ``infer`` 404 hexagonal prisms with permeability and 637 points;
-    ``check`` two maps of the cubes.
+    ``check`` three maps of the cubes.
     """
     from scipy.spatial.transform import Rotation
 
@@ -206,7 +206,8 @@ def make_waiting(folder: Path) -> dict[str, float]:
             "shape": "polygon", "sides": 6, "radius_m": 0.004, "size_z_m": 0.018,
             "recoil_permeability": 1.05}),
         "check-2565": (cubes, factors, _grid(9, 0.05, 45, 0.06), pose, {}),
-        "check-8892": (cubes, factors, _grid(15, 0.05, 52, 0.06), pose, {})}
+        "check-8892": (cubes, factors, _grid(15, 0.05, 52, 0.06), pose, {}),
+        "check-50000": (cubes, factors, _grid(29, 0.05, 80, 0.06), pose, {})}
     for name, (places, strengths, points, turned, shape) in tables.items():
         here = folder / name
         here.mkdir(parents=True, exist_ok=True)

@@ -537,5 +537,5 @@ def test_lists_of_effects_have_each_name_once(monkeypatch, listed):
     """A second effect of a name would take the place of the first. Control: lists as they are."""
     assert catalogue()
     monkeypatch.setattr(magnetization, "EFFECTS", listed(magnetization.EFFECTS))
-    with pytest.raises(StudyError, match=r"module magnetization .* effects with names of their own"):
+    with pytest.raises(StudyError, match=r"module magnetization .* names of their own"):
         catalogue()
