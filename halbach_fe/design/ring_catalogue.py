@@ -221,7 +221,14 @@ def designed(study: Study, rings: Sequence[Ring]) -> Study:
 
 
 def about_origin(study: Study) -> Magnet:
-    """Return the magnet of a study with its rings stacked about z = 0, as those of a design are."""
+    """Return the magnet of a study with its rings stacked about z = 0, as those of a design are.
+
+    Raises
+    ------
+    StudyError
+        If rings cannot be designed for the study, such as beside iron that they may overlap.
+    """
+    design_of(study)
     return build_magnet(study.with_(array__ring=[
         ring.with_(z_m=None) for ring in study.array.ring]))
 

@@ -532,8 +532,8 @@ def page(assembly: Assembly, progress: Progress = quiet) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)
     turned = ("" if not kinds or "to order" not in kinds[0] else " Where the shape looks the same "
-              "upside down, or a cube on another side, kinds whose magnetization turns with it are "
-              "the same block.")
+              "upside down, a cube or bar on another side, or a cylinder turned about its axis, "
+              "kinds whose magnetization turns with it are the same block.")
     first, *solids = solid_names(assembly)
     return Page("cad", "assembly", assembly.magnet.study, answer(assembly), _summary(assembly), [
         Section([

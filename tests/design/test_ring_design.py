@@ -14,7 +14,7 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import ring_catalogue
-from halbach_fe.design.ring_catalogue import Catalogue, largest_number, tables_of
+from halbach_fe.design.ring_catalogue import Catalogue, about_origin, largest_number, tables_of
 from halbach_fe.design.ring_catalogue import designed as designed_study
 from halbach_fe.design.ring_design import Task, _best_pair, design_rings, search, task_of
 from halbach_fe.geometry.magnet import build_magnet
@@ -285,6 +285,16 @@ def test_studies_that_cannot_be_designed_are_refused(changes, message, session):
                          if value is not None})
     with pytest.raises(StudyError, match=message):
         design_rings(other, session, REGION)
+
+
+def test_a_coil_is_refused_before_rings_are_moved_into_it():
+    away = parse_study(DOCUMENT | {
+        "array": DOCUMENT["array"] | {"ring": [{"z_m": 0.3}]}, "external": {"coils": [{
+            "kind": "round", "radius_m": 0.065, "current_A": 200.0,
+            "section_m": [0.002, 0.002]}]}})
+    assert build_magnet(away)
+    with pytest.raises(StudyError, match="coils or dipoles"):
+        about_origin(away)
 
 
 def test_command_line(tmp_path):
