@@ -17,6 +17,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.array_layout import blocks_of_array
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.array_keys import BlockException
@@ -383,17 +384,20 @@ def with_array(study: Study, **keys: Any) -> Study:
     return study.with_(array=study.array.with_(**keys))
 
 
-def blocks_at(magnet: Magnet, place: Place) -> list[int]:
+def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of a study; those that overlap are refused where its magnet is built."""
+    return blocks_of_array(study.array, study.dimension)
+
+
+def blocks_at(blocks: Sequence[MagnetBlock], place: Place) -> list[int]:
     """Return the numbers of the blocks at a place, counted from 0."""
-    if place.ring and place.slot:
-        return [magnet.number_of(place.ring, place.slot)]
-    return [number for number, block in enumerate(magnet.blocks)
+    return [number for number, block in enumerate(blocks)
             if place.ring in (0, block.ring) and place.slot in (0, block.slot)]
 
 
 def each_block(study: Study) -> list[Place]:
     """Return a place for every block that is not missing."""
-    return [place_of(block) for block in build_magnet(study).blocks if block.remanence]
+    return [place_of(block) for block in blocks_of(study) if block.remanence]
 
 
 def place_of(block: MagnetBlock, other: MagnetBlock | None = None) -> Place:
@@ -410,7 +414,7 @@ def can_be_uneven(block: MagnetBlock) -> bool:
 
 def each_ring(study: Study) -> list[Place]:
     """Return a place for every ring; none in two dimensions."""
-    rings = {block.ring for block in build_magnet(study).blocks if block.remanence}
+    rings = {block.ring for block in blocks_of(study) if block.remanence}
     return [] if study.dimension == 2 else [Place(ring) for ring in sorted(rings)]
 
 
@@ -428,7 +432,7 @@ def with_remanence(study: Study) -> Study:
 
 def changed(nominal: NominalFields, study: Study) -> Floats:
     """Return B (n, 3) in T of the nominal blocks of ``study``, less that of ``nominal``."""
-    blocks = build_magnet(study).blocks
+    blocks = blocks_of(study)
     others = np.flatnonzero([new != old for new, old in zip(blocks, nominal.blocks, strict=True)])
     return np.asarray(nominal.fields_of([blocks[number] for number in others]).sum(axis=0)
                       - nominal.block_fields[others].sum(axis=0))

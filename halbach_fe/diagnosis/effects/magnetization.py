@@ -17,6 +17,7 @@ from halbach_fe.diagnosis.effects.base import (
     Parameter,
     Place,
     blocks_at,
+    blocks_of,
     can_be_uneven,
     each_block,
     each_ring,
@@ -48,7 +49,7 @@ class BlockMissingEffect(Effect):
     def magnetization_change(
         self, nominal: NominalFields, place: Place
     ) -> Mapping[int, Floats] | None:
-        (block,) = blocks_at(nominal.magnet, place)
+        (block,) = blocks_at(nominal.blocks, place)
         return {block: (self.factor - 1) * nominal.magnetizations[block]}
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -79,7 +80,7 @@ class BlockDemagnetizedEffect(MagnetizationEffect):
         return each_block(study)
 
     def rates(self, magnet: Magnet, place: Place) -> Mapping[int, Sequence[float]]:
-        return dict.fromkeys(blocks_at(magnet, place), (-1.0,))
+        return dict.fromkeys(blocks_at(magnet.blocks, place), (-1.0,))
 
 
 class RingDemagnetizedEffect(BlockDemagnetizedEffect):
@@ -108,14 +109,14 @@ class MagnetizationGradientEffect(Effect):
     parameters = (Parameter("gradient", "1", 0.02),)
 
     def places(self, study: Study) -> Sequence[Place]:
-        blocks = build_magnet(study).blocks
+        blocks = blocks_of(study)
         uneven = {block.place for block in blocks if can_be_uneven(block)}
         each = [place for place in each_block(study) if (place.ring, place.slot) in uneven]
         return [Place(), *each] if len(uneven) == len(blocks) else each
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         per_unit = nominal.gradient_fields
-        return np.asarray(per_unit[blocks_at(nominal.magnet, place)].sum(axis=0))[None]
+        return np.asarray(per_unit[blocks_at(nominal.blocks, place)].sum(axis=0))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         return _more_uneven(study, place, values[0], "magnetization_gradient", "gradient")
@@ -126,11 +127,11 @@ def _more_uneven(study: Study, place: Place, change: float, key: str, name: str)
 
     ``key`` is its key in exceptions, ``name`` that of the attribute of blocks.
     """
-    magnet = build_magnet(study)
-    present = {number: getattr(magnet.blocks[number], name) for number in blocks_at(magnet, place)}
+    blocks = blocks_of(study)
+    present = {number: getattr(blocks[number], name) for number in blocks_at(blocks, place)}
     return with_exceptions(study, [
         BlockException.model_validate(where | {key: value + float(change)})
-        for where, value in together(magnet.blocks, present)])
+        for where, value in together(blocks, present)])
 
 
 class CornersDemagnetizedEffect(Effect):
@@ -144,7 +145,7 @@ class CornersDemagnetizedEffect(Effect):
     parameters = (Parameter("loss", "1", 0.1),)
 
     def places(self, study: Study) -> Sequence[Place]:
-        return [Place()] if all(map(can_be_uneven, build_magnet(study).blocks)) else []
+        return [Place()] if all(map(can_be_uneven, blocks_of(study))) else []
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         lost = [replace(block, corner_loss=block.corner_loss + 1) for block in nominal.blocks]
@@ -252,7 +253,7 @@ class BlockPutInWronglyEffect(AssemblyEffect):
 
     def places(self, study: Study) -> Sequence[Place]:
         return list(dict.fromkeys(
-            _place(block, np.array(turn)) for block in build_magnet(study).blocks
+            _place(block, np.array(turn)) for block in blocks_of(study)
             if block.remanence for turn in (*turns_in_slot(block), *turns_over(block))))
 
     def simpler(self, magnet: Magnet) -> Sequence[Sources]:
@@ -303,7 +304,7 @@ class BlocksSwappedEffect(AssemblyEffect):
     def places(self, study: Study) -> Sequence[Place]:
         """Return pairs of successive blocks of a ring, as examples; the search uses `shortlist`."""
         rings: dict[int, list[MagnetBlock]] = {}
-        for block in build_magnet(study).blocks:
+        for block in blocks_of(study):
             rings.setdefault(block.ring, []).append(block)
         return [place_of(block, after) for ring in rings.values()
                 for block, after in zip(ring, ring[1:] + ring[:1], strict=True)
@@ -318,7 +319,7 @@ class BlocksSwappedEffect(AssemblyEffect):
         evidence of the exchange is c' score - c' information c / 2. Both terms follow for all pairs
         at once from the entries of the two blocks.
         """
-        blocks, size = build_magnet(study).blocks, study.dimension
+        blocks, size = blocks_of(study), study.dimension
         vectors = mean.reshape(len(blocks), size)
         turns = np.array([block.shape_axes[:size, :size] for block in blocks])
         own = np.einsum("jba,jb->ja", turns, vectors)

@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects.base import (
     MagnetizationEffect,
     Parameter,
     Place,
+    blocks_of,
     together,
     with_array,
     with_exceptions,
@@ -85,7 +86,7 @@ def _with_permeabilities(
                                     for one in array.exceptions):
         return with_array(with_remanence(study), **keys(
             array.recoil_permeability, array.recoil_permeability_across))
-    blocks = build_magnet(study).blocks
+    blocks = blocks_of(study)
     present = {number: (block.recoil_permeability,
                         None if block.isotropic else block.recoil_permeability_across)
                for number, block in enumerate(blocks) if block.remanence}
@@ -181,7 +182,7 @@ class KneeEffect(Effect):
         material = study.demagnetization
         if study.dimension == 2 or (material is not None and material.irreversible):
             return []
-        blocks = build_magnet(study).blocks
+        blocks = blocks_of(study)
         strongest = max((abs(block.remanence) for block in blocks), default=0.0)
         # largest number of blocks for which losses are searched unless the study describes the
         # material: each place takes a solution of the whole magnet, of a few seconds for 64 blocks
@@ -281,7 +282,7 @@ def _mean_losses(study: Study, materials: Sequence[Demagnetization | None]) -> F
     """Return the change of the mean polarization of every block (materials, 3 blocks) in T, if each
     is in the field of the intact blocks in vacuum.
     """
-    blocks = build_magnet(study).blocks
+    blocks = blocks_of(study)
     # Gauss nodes per direction and block at which the field is computed for the cheap estimate
     nodes = 3
     cells = cells_of(blocks, 1, divisions=nodes)

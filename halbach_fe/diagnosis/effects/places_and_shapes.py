@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.effects.base import (
     Parameter,
     Place,
     blocks_at,
+    blocks_of,
     changed,
     each_block,
     each_ring,
@@ -32,7 +33,6 @@ from halbach_fe.diagnosis.effects.base import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.array_layout import ring_limits
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array_keys import Array, BlockException
 from halbach_fe.study.model import Study
 
@@ -107,7 +107,7 @@ class MoveRow(Effect):
         return places[::max(1, len(places) // self.few)] if self.few else places
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal.magnet, place)
+        moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal.blocks, place)
         return np.sum([self.by_block(nominal, place, number) for number in moving], axis=0)
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -154,7 +154,7 @@ def _oval(angle_deg: float) -> tuple[float, float]:
 
 def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of the blocks of oval rings, by slots if the rings are equal."""
-    blocks = build_magnet(study).blocks
+    blocks = blocks_of(study)
     return [BlockException(**where, displacement_m=(float(np.dot(values, _oval(angle))), 0.0, 0.0))
             for where, angle in together(blocks, {
                 number: block.angle_deg for number, block in enumerate(blocks)})]
@@ -249,7 +249,7 @@ def _planes(study: Study) -> list[Place]:
     """
     if study.dimension == 2:
         return []
-    blocks = [block for block in build_magnet(study).blocks if block.remanence]
+    blocks = [block for block in blocks_of(study) if block.remanence]
     middles = np.array([block.middle[:2] for block in blocks])
     counts = Counter(block.ring for block in blocks)
     # distance from the plane of a block beside it, at least: half of that of a regular ring
@@ -283,7 +283,7 @@ def _half(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
 
 def _halves_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of both halves, by slots if these are the same in all rings."""
-    shift, blocks = np.array(values) @ _in_plane(place.at_m[0]), build_magnet(study).blocks
+    shift, blocks = np.array(values) @ _in_plane(place.at_m[0]), blocks_of(study)
     sides = {number: _side(block.middle, place) for number, block in enumerate(blocks)}
     return [BlockException(**where, shift_m=tuple((side * shift).tolist()))
             for where, side in together(blocks, sides)]
