@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations
 
 import magpylib
 import numpy as np
@@ -16,7 +17,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, MagnetizationEffect, Place
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.summary import STUDY_FILE
-from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
+from halbach_fe.diagnosis.uncertain_effects import can_be_uncertain, with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.posterior_files import read_posterior, write_inference
@@ -30,7 +31,7 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.inference_keys import number_changes, shifted
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
-from tests.conftest import circle
+from tests.conftest import ROOT, circle
 from tests.diagnosis.campaign import drawn, field, table_of
 from tests.support.cuboids import DOCUMENT, NOISE_T
 from tests.support.pages import write_result
@@ -370,6 +371,21 @@ def test_a_study_at_an_amplitude_of_zero_has_the_numbers_that_change_with_it(eff
         for which, parameter in enumerate(effect.parameters):
             values = parameter.sd * np.eye(len(effect.parameters))[which]
             assert number_changes(none, effect.apply(study, place, values.tolist()))
+
+
+def test_what_two_effects_write_of_blocks_may_be_uncertain_together():
+    """Permeabilities along and across the easy axes were no numbers of one study.
+
+    The diagnosis of these blocks, where several effects may hide, ended with an error.
+    """
+    study = read_study(ROOT / "studies/hybrid-quadrupole/study.toml")
+    none = [IdentifiedEffect(Hypothesis(effect, place), *np.zeros((2, len(effect.parameters))), None)
+            for effect in catalogue() for place in effect.places(study)[:1]]
+    of_blocks = [one for one in none if one.hypothesis.apply(
+        study, one.values.tolist()).array.exceptions and can_be_uncertain(study, one)]
+    assert len(of_blocks) > 5
+    for pair in permutations(of_blocks, 2):
+        assert len(with_uncertain_effects(study, (), pair).uncertain) >= len(pair)
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [

@@ -79,16 +79,18 @@ def _with_permeabilities(
     study: Study, keys: Callable[[float, float | None], dict[str, float | None]]
 ) -> Study:
     """Return the study with keys by what the relative permeabilities are along the easy axis, and
-    across it where that is another value: of the array, or else of blocks.
+    across it where that is another value, or is stated by exceptions: of the array, or else of
+    blocks.
     """
     array = study.array
     if array.is_uniform and not any(one.recoil_permeability or one.recoil_permeability_across
                                     for one in array.exceptions):
         return with_array(with_remanence(study), **keys(
             array.recoil_permeability, array.recoil_permeability_across))
-    blocks = blocks_of(study)
-    present = {number: (block.recoil_permeability,
-                        None if block.isotropic else block.recoil_permeability_across)
+    blocks, is_stated = blocks_of(study), any(
+        one.recoil_permeability_across for one in array.exceptions)
+    present = {number: (block.recoil_permeability, block.recoil_permeability_across
+                        if is_stated or not block.isotropic else None)
                for number, block in enumerate(blocks) if block.remanence}
     return with_exceptions(study, [BlockException.model_validate(where | keys(*both))
                                    for where, both in together(blocks, present)])
