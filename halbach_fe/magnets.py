@@ -114,10 +114,10 @@ def halbach_ring(
         if value is not None or key.endswith("radius_m"):
             check_number(key, "halbach_ring", value)
     ring_length = None if length_m is None else length_m / rings
-    magnet = new_magnet(MagnetTemplate(
+    magnet = _without_position_noise(MagnetTemplate(
         order, blocks, rings, inner_radius_m, outer_radius_m, ring_length,
         MagnetTemplate.remanence_T if remanence_T is None else remanence_T, shape,
-        material=material), name)[0]
+        material=material), name)
     if material is not None:
         return magnet
     return magnet.with_(array__recoil_permeability=1.0 if recoil_permeability is None
@@ -172,7 +172,16 @@ def magnet_of_blocks(
         count = max((len(values) for values in columns.values()), default=0)
         columns.setdefault("name", [f"b{number}" for number in range(1, count + 1)])
         table = validated_blocks(columns, f"the blocks of {name}")
-    return new_magnet(MagnetTemplate(order), name, table=table)[0]
+    return _without_position_noise(MagnetTemplate(order), name, table)
+
+
+def _without_position_noise(
+    template: MagnetTemplate, name: str, table: FreeBlocks | None = None
+) -> Magnet:
+    """Return the magnet of a template as `new_magnet` does, but without noise of positions: no
+    file shows what a template assumes of the stage, and arrays of readings state ``sigma_T`` only.
+    """
+    return new_magnet(template, name, table=table)[0].with_(noise__position_sd_m=None)
 
 
 def _plain(column: Sequence[Any]) -> list[Any]:

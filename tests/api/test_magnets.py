@@ -316,6 +316,12 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
         hf.infer(magnet, points, readings[:, :2])
     with pytest.raises(hf.HalbachError, match=r"shapes \(n, 3\).*received \(119, 3\) and"):
         hf.explain(magnet, points[1:], readings, sigma_T=2e-5)
+    # sigma_T is all the noise there is: nobody has said that the positions are uncertain
+    used = result.response.matrix[~result.held_out] / 2e-5
+    covariance = np.linalg.inv(np.linalg.inv(result.prior.covariance) + used.T @ used)
+    sd = np.sqrt(np.diag(covariance))
+    assert np.allclose(result.posterior.covariance / np.outer(sd, sd),
+                       covariance / np.outer(sd, sd), rtol=0, atol=1e-6)  # inverses are rounded
     sizes = np.linalg.norm(result.posterior.mean.reshape(-1, 3), axis=1) / np.linalg.norm(
         magnet.nominal_magnetization.reshape(-1, 3), axis=1)
     assert sizes[2] == pytest.approx(0.98, abs=2e-3)

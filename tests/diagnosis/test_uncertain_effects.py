@@ -379,7 +379,8 @@ def test_what_two_effects_write_of_blocks_may_be_uncertain_together():
     The diagnosis of these blocks, where several effects may hide, ended with an error.
     """
     study = read_study(ROOT / "studies/hybrid-quadrupole/study.toml")
-    none = [IdentifiedEffect(Hypothesis(effect, place), *np.zeros((2, len(effect.parameters))), None)
+    none = [IdentifiedEffect(
+        Hypothesis(effect, place), *np.zeros((2, len(effect.parameters))), None)
             for effect in catalogue() for place in effect.places(study)[:1]]
     of_blocks = [one for one in none if one.hypothesis.apply(
         study, one.values.tolist()).array.exceptions and can_be_uncertain(study, one)]
