@@ -130,12 +130,14 @@ class Campaign:
     def replaced(self, chapter: Chapter) -> Chapter | None:
         """Return a later chapter of the same command, whose answers may all be used.
 
-        A diagnosis of the study that `register` wrote fits the pose anew, with the cause that the
-        registration lacked, and so takes its place.
+        It read the same data or more: by one of two maps, whose probes disagree, the answer may be
+        sound and wrong. A diagnosis of the study that `register` wrote fits the pose anew, with the
+        cause that the registration lacked, and so takes its place.
         """
         later = self.chapters[self.chapters.index(chapter) + 1:]
-        return next((one for one in later if one.sound and (one.verb == chapter.verb or (
-            (chapter.verb, one.verb) == ("register", "diagnose") and one.uses(chapter)))), None)
+        return next((one for one in later if one.sound and one.reads_data_of(chapter) and (
+            one.verb == chapter.verb or (
+                (chapter.verb, one.verb) == ("register", "diagnose") and one.uses(chapter)))), None)
 
     @property
     def answer(self) -> Answer:

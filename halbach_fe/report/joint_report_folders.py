@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.numbers import first_of
@@ -49,6 +49,9 @@ one magnet. A diagnosis moves them by fractions of a millimetre (gaps, radii, le
 MOST_RECORD_BYTES, MOST_FIGURE_BYTES = 2**27, 2**24
 """Largest sizes of page.json (100 000 free blocks take a tenth of it) and of a figure."""
 
+SUMMARY = "summary.json"
+"""The main figures of an update."""
+
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -63,6 +66,15 @@ class Page:
     """Its most telling figure."""
 
 
+class Component(BaseModel):
+    """A component of the updated field, as summary.json has it."""
+
+    at_m: tuple[float, float, float]
+    along: tuple[float, float, float]
+    mean_T: float
+    sd_T: float
+
+
 @dataclass(frozen=True, eq=False)
 class Chapter:
     """The results in a folder."""
@@ -74,6 +86,8 @@ class Chapter:
     pages: tuple[Page, ...]
     changed: tuple[str, ...]
     """Results that somebody has changed or, but for figures, removed since."""
+    field: Component | None = None
+    """The strongest component of the field, of an update."""
 
     @property
     def verb(self) -> str:
@@ -113,6 +127,15 @@ class Chapter:
         mine, others = ({digest for name, digest in one.record.inputs.items()
                          if name.endswith(".toml")} for one in (self, other))
         return bool(mine & others)
+
+    def reads_data_of(self, other: Chapter) -> bool:
+        """Tell whether this command read at least the data that another one did, by their names.
+
+        Maps and tables may have been corrected in between, and studies may be other versions.
+        """
+        mine, others = ({PurePath(path).name for path in one.record.inputs
+                         if not path.endswith(".toml")} for one in (self, other))
+        return mine >= others
 
 
 def read_chapters(folders: Sequence[Path]) -> list[Chapter]:
@@ -175,7 +198,19 @@ def _chapter(results: Results, label: str) -> Chapter:
     if not pages:
         raise refused("results with a page", f"which has no {PAGE_RECORD}")
     removed = [f"{name} (removed)" for name in results.removed() if not name.endswith(".png")]
-    return Chapter(results.folder, label, record, tuple(pages), (*results.changed(), *removed))
+    return Chapter(results.folder, label, record, tuple(pages), (*results.changed(), *removed),
+                   _field(results))
+
+
+def _field(results: Results) -> Component | None:
+    """Return the strongest component of the field of an update, if its summary tells."""
+    if SUMMARY not in results.record.files:
+        return None
+    try:
+        summary = json.loads(results.read(SUMMARY, MOST_RECORD_BYTES))
+        return Component.model_validate(summary["strongest_field"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # changed since, or of another command
 
 
 def _picture(results: Results, folder: PurePath, said: PageRecord) -> Picture | None:
@@ -280,6 +315,7 @@ def doubts(chapters: Sequence[Chapter]) -> list[str]:
     """Return a sentence for everything that does not fit together."""
     return [*_changed(chapters), *_out_of_date(chapters), *_other_files(chapters),
             *_unused_findings(chapters), *_unused_blocks(chapters), *_unrelated(chapters),
+            *_contradictions(chapters),
             *(text for text, kind in _versions(chapters) if kind == OF_ANOTHER_MAGNET)]
 
 
@@ -367,6 +403,30 @@ def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
             "--blocks."]
 
 
+def _contradictions(chapters: Sequence[Chapter]) -> list[str]:
+    """Name updates whose fields at one place differ by more than their error bars allow.
+
+    One that is sound stands for those that are not, if it read their data.
+    """
+    allowed = 5.0  # standard deviations of the difference, as if the updates shared nothing
+    found = []
+    for (one, mine), (other, its) in combinations([
+            (each, each.field) for each in chapters if each.field is not None], 2):
+        apart = abs(mine.mean_T - its.mean_T)
+        is_settled = any(good.sound and not bad.sound and good.reads_data_of(bad)
+                         for good, bad in ((one, other), (other, one)))
+        if (mine.at_m, mine.along) == (its.at_m, its.along) and not is_settled and (
+                apart > allowed * math.hypot(mine.sd_T, its.sd_T)):
+            place = ", ".join(f"{round(1e3 * value, 6) + 0.0:.6g}" for value in mine.at_m)
+            found.append(
+                f"{one.label} and {other.label} contradict each other: at ({place}) mm they have "
+                f"fields of {1e3 * mine.mean_T:.6g} and {1e3 * its.mean_T:.6g} mT, "
+                f"{1e3 * apart:.3g} mT apart, with error bars of {1e3 * mine.sd_T:.2g} and "
+                f"{1e3 * its.sd_T:.2g} mT. At least one of them leaves out an error of its probe: "
+                "give `instrument_sd.gain`, or compare their maps by halbach-fe check.")
+    return found
+
+
 def _unrelated(chapters: Sequence[Chapter]) -> list[str]:
     """Name results without a study whose input no other result has to do with."""
     found = []
@@ -387,8 +447,10 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
     for one in chapters:
         if (study := one.study) is None:
             continue
-        of_same = [group for version, group in groups
-                   if not differences(_plain(version), _plain(study))]
+        of_same = [group for version, group in groups if all(
+            # the study of an update has the instrument that it found
+            key.partition(".")[0] in OF_MAPPER and any(map(one.shares_study_with, group))
+            for key in differences(_plain(version), _plain(study)))]
         if of_same:
             of_same[0].append(one)
         else:

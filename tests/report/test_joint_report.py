@@ -566,6 +566,47 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
         "other,")
 
 
+def updates_of_two_maps(home, first_T, second_T, sound):
+    """An update by one map, as sound as the other that read two."""
+    (home / "second.csv").write_text("second")
+    poor = Answer("Like what?", "Much.", "Only in part.", "Look.", "", sound)
+    for name, field_T, maps, answer in (("both", first_T, ["map.csv", "second.csv"], poor),
+                                        ("one", second_T, ["map.csv"], None)):
+        with result_folder(home / name, "halbach-fe infer", "tiny",
+                           [home / "study.toml", *(home / one for one in maps)]):
+            write_text(home / name / "summary.json", json.dumps({"strongest_field": {
+                "at_m": [0.01, 0, 0], "along": [1, 0, 0], "mean_T": field_T, "sd_T": 2e-5}}))
+            write_any_page(home / name / "page.html", [], STUDY, answer=answer or Answer(
+                "Like what?", "Little.", "Yes.", "Look.", ""))
+    return found_in(home, "both", "one")
+
+
+def test_a_sound_update_by_less_data_takes_no_place(home):
+    """By one of two maps, whose probe is 1 % off, it is sound and wrong."""
+    found = updates_of_two_maps(home, 0.353590, 0.357113, sound=False)
+    assert "takes its place" not in found.answer.said
+    assert found.doubts == [
+        "both and one contradict each other: at (10, 0, 0) mm they have fields of 353.59 and "
+        "357.113 mT, 3.52 mT apart, with error bars of 0.02 and 0.02 mT. At least one of them "
+        "leaves out an error of its probe: give `instrument_sd.gain`, or compare their maps by "
+        "halbach-fe check."]
+    assert found.answer.trust.startswith("No: they do not all fit together")
+
+
+def test_updates_that_agree_within_their_bars_fit(home):
+    assert updates_of_two_maps(home, 0.353590, 0.353600, sound=True).answer.sound
+
+
+def test_the_instrument_that_an_update_found_makes_no_other_version(home):
+    """Control: another instrument in another file."""
+    found = another(instrument={"gain": [0.01, 0.01, 0.01]})
+    results(home / "found", "infer", found, [home / "study.toml", home / "map.csv"])
+    assert found_in(home, "field", "found").versions == []
+    (home / "other.toml").write_text("other")
+    results(home / "other", "infer", found, [home / "other.toml", home / "map.csv"])
+    assert "another version" in found_in(home, "field", "other").versions[0]
+
+
 def test_a_diagnosis_takes_the_place_of_the_registration_before_it(home):
     """Which lacked the cause; it fits the pose anew. Control: a diagnosis of another study."""
     poor = Answer("Where?", "There.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False)
