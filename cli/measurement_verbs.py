@@ -383,7 +383,8 @@ def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
     Writes diagnosis.html and its figures, diagnosis.json, and study.diagnosed.toml: the study's own
     file with the identified effects added, which `halbach-fe solve` and `halbach-fe infer` can use
-    without further changes.
+    without further changes; and blocks.csv, the table of --blocks as it fits that study, if its
+    rings are others.
     """
     from halbach_fe.diagnosis.discriminating_measurements import separations
     from halbach_fe.report.diagnosis_page import page
@@ -404,7 +405,7 @@ def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
         diagnosis = hf.diagnose(magnet, data, session, blocks, arguments.effects, validation_map,
                                 common.say, floor, arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
-    return page(diagnosis, separating, study)
+    return page(diagnosis, separating, study, blocks)
 
 
 def floors_of(
@@ -557,11 +558,14 @@ class _Explanation:
 
     def diagnose(self) -> bool:
         """Look for what the study lacks, and tell whether it was found and may be used."""
-        from halbach_fe.diagnosis.summary import STUDY_FILE
+        from halbach_fe.diagnosis.summary import BLOCKS_FILE, STUDY_FILE
 
         found = self.run("diagnose", "diagnosed", self.study)
         if found.changes_study:
-            self.study = InputFile(self.arguments.output / "diagnosed" / STUDY_FILE)
+            folder = self.arguments.output / "diagnosed"
+            self.study = InputFile(folder / STUDY_FILE)
+            if (folder / BLOCKS_FILE).exists():
+                self.arguments.blocks = InputFile(folder / BLOCKS_FILE)
         return found.sound and found.changes_study
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
@@ -15,10 +16,17 @@ from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
 from halbach_fe.geometry.array_layout import blocks_of_table, blocks_table
-from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
+from halbach_fe.geometry.blocks import MagnetBlock, block_in_words, rotation_about_z
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Prism, at_heights, upright
+from halbach_fe.geometry.outline import (
+    Outline,
+    Prism,
+    at_heights,
+    outline_centroid,
+    points_on,
+    upright,
+)
 from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
@@ -59,16 +67,14 @@ class Kind:
     @property
     def part(self) -> tuple[object, ...]:
         """The first `identity` of the block in all positions in which its outline is the same: a
-        cube has 24, a cylinder any about its axis, and all but prisms are alike upside down.
+        cube has 24, a cylinder any about its axis, and others those of `_turns_of`.
         """
         sizes, direction = self.sizes, self.direction
-        if sizes["shape"] == "prism":
-            return self.identity
         if sizes["shape"] == "cylinder":
             direction = np.array([np.hypot(*direction[:2]), 0.0, direction[2]])
         if sizes["shape"] != "cuboid":
-            return min(replace(self, direction=direction * sign).identity
-                       for sign in ([1, 1, 1], [1, -1, -1]))
+            return min(replace(self, direction=turn @ direction).identity
+                       for turn in _turns_of(self.solid.outline))
         sides = ("size_x_m", "size_y_m", "size_z_m")
         lengths = np.array([sizes[side] for side in sides])
         return min(replace(self, direction=turn @ direction, sizes=sizes | dict(
@@ -107,6 +113,24 @@ class Kind:
         text = f"along {along}" if along else (
             f"{abs(turn):g}° from x towards {'−' * (turn < 0)}y")
         return text + (f", {abs(rise):g}° towards {'−' * (rise < 0)}z" if rise else "")
+
+
+@lru_cache(maxsize=4096)  # most blocks of a magnet have the outline of another one
+def _turns_of(outline: Outline) -> tuple[Floats, ...]:
+    """Return the rotations (3, 3) that bring a prism onto itself, about its axis and upside down.
+
+    Every one brings the corner that is farthest from the middle to a corner.
+    """
+    same_m = 1e-7  # to which sizes are rounded
+    corners = points_on(outline) - outline_centroid(outline)
+    tree, angle = cKDTree(corners), np.arctan2(*corners.T[::-1])
+    farthest, found = int(np.argmax(np.hypot(*corners.T))), []
+    for over in (1, -1):
+        for to in angle:
+            turn = rotation_about_z(to - over * angle[farthest]) @ np.diag([1.0, over, over])
+            if tree.query(corners @ turn[:2, :2].T)[0].max() < same_m:
+                found.append(turn)
+    return tuple(found)
 
 
 @dataclass(frozen=True)

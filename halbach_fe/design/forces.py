@@ -594,14 +594,15 @@ def _coil_elements(
     """Yield places and I dl of the pieces of all coils, of a fine and a coarser division.
 
     The field of iron varies along a winding over the distance of the iron: pieces are shorter than
-    that by a factor by which Gauss's rule is right to 1e-5, and twice as long for the error bar.
+    that by a factor by which Gauss's rule is right to 1e-5, and twice as long for the error bar;
+    also where there would be too many, and they are as long as the number that they may have.
     """
     coils = magnet.external.coils
     tree = KDTree(iron.nodes(64)) if coils else None
     apart = [float(tree.query(points_in_winding(coil))[0].min()) for coil in coils if tree]
-    for share in (0.3, 0.6):
+    for share, most in ((0.3, 40_000), (0.6, 5_000)):
         pieces = [(np.zeros((0, 3)), np.zeros((0, 3))), *(
-            current_elements(coil, share * away)
+            current_elements(coil, share * away, most)
             for coil, away in zip(coils, apart, strict=True))]
         places, currents = (np.vstack(each) for each in zip(*pieces, strict=True))
         yield places, currents

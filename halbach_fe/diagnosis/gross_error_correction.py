@@ -32,6 +32,7 @@ from halbach_fe.diagnosis.linearization import Training
 from halbach_fe.diagnosis.result import FoundPose, IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.inference.block_prior import with_types
 from halbach_fe.inference.registration import odds, register, register_maps, registered_study
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
@@ -161,11 +162,18 @@ def correct_map_errors(
 
 
 def blocks_of(blocks: BlockTable | None, study: Study, corrected: Study) -> BlockTable | None:
-    """Return the measured blocks, without their places if the corrected study has other rings."""
-    if blocks is None or corrected.array.blocks_by_ring == study.array.blocks_by_ring:
+    """Return the measured blocks as they are to be used with the corrected study.
+
+    Those of the study's own rings, if the corrected study has others, are samples of their types:
+    where they are mounted is not known then. A table of other rings is left as it is, since it may
+    be of the corrected ones.
+    """
+    rings = len(study.array.blocks_by_ring)
+    if blocks is None or corrected.array.blocks_by_ring == study.array.blocks_by_ring or (
+            blocks.ring.max() != rings):
         return blocks
     unplaced = np.zeros_like(blocks.ring)
-    return replace(blocks, ring=unplaced, slot=unplaced)
+    return replace(with_types(build_magnet(study), blocks), ring=unplaced, slot=unplaced)
 
 
 def beside_amplitudes(blocks: BlockTable | None, study: Study) -> BlockTable | None:

@@ -45,6 +45,7 @@ from halbach_fe.measurement.probe_law import row_order_note
 from halbach_fe.study.model import Study
 
 STUDY_FILE = "study.diagnosed.toml"
+BLOCKS_FILE = "blocks.csv"
 """Names of the files that a diagnosis writes."""
 
 DISPLAY_UNITS = {

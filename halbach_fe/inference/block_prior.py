@@ -52,6 +52,10 @@ NOT_NORMAL = 0.05
 """Adjusted p-value below which samples count as not normal. A table of normally distributed blocks
 is suspected in 5 % of all cases."""
 
+OTHER_RINGS = ("If the magnet has the blocks of the table, and no others, correct rings and blocks "
+               "of [array] in the study.")
+"""What to do with a table of other places than the study's."""
+
 FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
@@ -543,7 +547,7 @@ def _check_types(magnet: Magnet, table: BlockTable) -> None:
                 f"place of block {serial}", table.source,
                 f"within {len(magnet.blocks_by_ring)} rings of "
                 f"{', '.join(map(str, sorted(set(magnet.blocks_by_ring))))} blocks",
-                f"ring {ring}, slot {slot}"))
+                f"ring {ring}, slot {slot}", OTHER_RINGS))
         if slot and magnet.number_of(ring, slot) not in types[label]:
             slots = dict.fromkeys(magnet.blocks[number].slot for number in types[label])
             raise MeasurementError(must_be(
@@ -562,7 +566,8 @@ def _check_complete(magnet: Magnet, table: BlockTable, used: Set[int]) -> None:
     if table.ring.any() and missing:
         raise MeasurementError(must_be(
             "places", table.source, "given for every block of the magnet, or for none",
-            f"none for ring {missing[0][0]}, slot {missing[0][1]} ({len(missing)} such places)"))
+            f"none for ring {missing[0][0]}, slot {missing[0][1]} ({len(missing)} such places)",
+            OTHER_RINGS))
 
 
 def _block_of_rows(magnet: Magnet, table: BlockTable) -> Ints:

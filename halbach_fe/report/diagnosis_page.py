@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 from halbach_fe.core.numbers import EMPTY_CELL
@@ -13,9 +14,11 @@ from halbach_fe.diagnosis.effect_selection import (
     EFFECT_PRIOR_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
 )
+from halbach_fe.diagnosis.gross_error_correction import blocks_of
 from halbach_fe.diagnosis.marginal_evidence import DISCOVERIES, ResidualGroup
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
+    BLOCKS_FILE,
     STUDY_FILE,
     amounts,
     changed_studies,
@@ -27,6 +30,7 @@ from halbach_fe.diagnosis.summary import (
     rivals,
 )
 from halbach_fe.inference.result import ALL_READINGS
+from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.probe_law import row_order_note
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_answer import (
@@ -141,6 +145,7 @@ def _floor(diagnosis: Diagnosis, region: str, component: str) -> float:
 
 def page(
     diagnosis: Diagnosis, separations: Sequence[Separation] = (), study: Study | None = None,
+    blocks: BlockTable | None = None,
 ) -> Page:
     """Return the page of a diagnosis, and the study with the identified effects added.
 
@@ -150,7 +155,17 @@ def page(
         Further measurements, see `halbach_fe.diagnosis.discriminating_measurements.separations`.
     study : Study, optional
         The study before the diagnosis, if gross errors of it were corrected.
+    blocks : BlockTable, optional
+        The measured blocks, which are written as they fit the study with other rings.
     """
+    study = study or diagnosis.before.study
+    fitting = blocks_of(blocks, study, diagnosis.study)
+    tables = {} if fitting is None or fitting is blocks else {
+        BLOCKS_FILE: partial(write_blocks, fitting)}
+    said = answer(diagnosis)
+    if tables and STUDY_FILE in said.command:
+        said = replace(said, command=said.command.replace(
+            " -o DIR", f" --blocks DIR/{BLOCKS_FILE} -o DIR"))
     drawn = {f"diagnosis_{name}.png": (partial(draw, diagnosis), text)
              for name, (draw, text) in FIGURES.items()}
     if figures.is_scattered(diagnosis.before):
@@ -167,7 +182,7 @@ def page(
     added = "with the findings added, each with a comment" if rows else "without changes"
     times = f"{diagnosis.rounds} {'times' if diagnosis.rounds > 1 else 'time'}"
     return Page(
-        "diagnose", "what the model lacks", diagnosis.before.study, answer(diagnosis),
+        "diagnose", "what the model lacks", diagnosis.before.study, said,
         diagnosis_summary(diagnosis, separations), [
             _what_is_missing(diagnosis, rows), *_what_else(diagnosis, separations, titles, rows),
             *_grounds(diagnosis), left_out_section(diagnosis.after),
@@ -175,13 +190,15 @@ def page(
             Section([View(lambda: view_of_inference(diagnosis.after, places),
                           colours_in_words(diagnosis.after))]),
             Section([f"{STUDY_FILE} beside this page is the study's file {added}; halbach-fe solve "
-                     f"and infer accept it unchanged. The model was solved {times}."],
+                     f"and infer accept it unchanged. The model was solved {times}."
+                     + f" With its rings, {BLOCKS_FILE} takes the place of --blocks: where these "
+                     "blocks are mounted is not known then." * bool(tables)],
                     "The study with what was missing" if rows else "The study")],
         {"Missing from the study": found,
          "The model before and after": change_table(diagnosis),
          "Rms difference of model and readings": residual_table(diagnosis),
          "Where nobody measured": left_out_table(diagnosis.after)},
-        rows, drawn, stem="diagnosis",
+        rows, drawn, files=tables, stem="diagnosis",
         remarks=[BAYES_FACTOR_IN_WORDS if found else "", order],
         new_study=(STUDY_FILE, partial(
             changed_studies, study or diagnosis.corrected_study, diagnosis)))

@@ -251,6 +251,10 @@ def _next_step(best: Registration, name: str, stated: Instrument) -> tuple[str, 
                 "components of B that are missing, or narrow the search by what is known of the "
                 "place (--across-m, --turn-rad), and register again.",
                 f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
+    if best.doubts and not best.apart:
+        return ("Look for what the model lacks, with the study as it is: as this pose does not "
+                "explain the map, neither is the probe what it is in it.",
+                f"halbach-fe diagnose STUDY{maps} -o DIR")
     if _is_near(best, stated) and not best.apart:
         return ("Look for what the model lacks. The map lies about where the study states it, and "
                 "diagnose finds small shifts and turns by itself.",

@@ -12,6 +12,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.design.ring_design import Designed, RingDesign
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity_page import SIZES, slices_figure
 from halbach_fe.report.page import (
@@ -52,9 +53,15 @@ def answer(found: Designed) -> Answer:
     if best.peak_to_peak_ppm > 1e6 * PERCENT_FROM:
         text.append(f"That varies by {relative(1e-6 * best.peak_to_peak_ppm)}: it is no "
                     "homogeneous field.")
-    least = smallest(found)
+    least, question = smallest(found), f"Which rings make a homogeneous field in {region}?"
+    if beside := beside_the_rings(found):
+        return Answer(
+            question, " ".join(text), f"No. {beside}",
+            "State a region between the rings: its middle by --centre-m, or as centre_m of "
+            "[homogeneity] in the study. What these rings make elsewhere, homogeneity says.",
+            "halbach-fe design STUDY -o DIR", sound=False)
     return Answer(
-        f"Which rings make a homogeneous field in {region}?", " ".join(text),
+        question, " ".join(text),
         (f"Yes, as the design of the {least} that the search found, which does not prove that "
          "there is no better one. These are blocks as ordered: their tolerances leave more."
          f"{at_limits(found)}")
@@ -63,6 +70,20 @@ def answer(found: Designed) -> Answer:
         "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
         f"halbach-fe {'homogeneity DIR/' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
         found.reached)
+
+
+def beside_the_rings(found: Designed) -> str:
+    """Say that the middle of the region is not within the rings, or nothing."""
+    magnet = build_magnet(found.study)
+    x, y, z = np.array(found.region.centre_m) - magnet.middle_m
+    low, high = np.array(magnet.array_ends) - magnet.middle_z_m
+    beyond, off = max(low - z, z - high), np.hypot(x, y) - magnet.free_radius
+    if max(beyond, off) <= 0:
+        return ""
+    where = (f"{1e3 * beyond:.3g} mm beyond the end of the rings" if beyond > 0 else
+             f"{1e3 * off:.3g} mm outside of the bore")
+    return (f"The middle of the region is {where}: the numbers are those of the stray field there, "
+            "and not of what rings are for.")
 
 
 def at_limits(found: Designed) -> str:

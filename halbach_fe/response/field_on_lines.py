@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_simpson, simpson
+from scipy.integrate import cumulative_simpson
 
 from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
@@ -146,8 +146,8 @@ class FieldOnLines(ShownInNotebook):
         Mean and root of J of the block or iron in which a point is; 0 in air.
     in_block : ndarray of str, shape (lines, count)
         Name of that block, ``iron 1`` in the first body of iron, empty in air.
-    spacing : ndarray, shape (lines,), in T m
-        Error that the spacing of the points makes of a first integral.
+    spacing : ndarray, shape (2, lines), in T m and T m^2
+        Error that the spacing of the points makes of first and of second integrals.
     slope : Slope, optional
         Derivative of B along u. Grids of lines have it, for kicks.
     measured : bool
@@ -189,20 +189,20 @@ class FieldOnLines(ShownInNotebook):
         """
         mean, root, error = (self._integrated(values, order)[:, -1]
                              for values in (self.mean, self.root, self.error))
-        spacing = self.spacing * self.lines.length ** (order - 1)
-        return mean, np.hypot(np.linalg.norm(root, axis=-1), error + spacing[:, None])
+        return mean, np.hypot(np.linalg.norm(root, axis=-1),
+                              error + self.spacing[order - 1][:, None])
 
     @property
     def relative_spacing(self) -> float:
-        """The largest `spacing`, relative to the largest integral of |B|.
+        """The largest `spacing` of first integrals, relative to the largest integral of |B|.
 
         It is 0 where the field is nothing but rounding, as on the axis of a quadrupole.
         """
         nothing_T = 1e-12
-        if np.abs(self.mean).max() <= nothing_T >= self.spacing.max() / self.lines.length:
+        if np.abs(self.mean).max() <= nothing_T >= self.spacing[0].max() / self.lines.length:
             return 0.0
         whole = self._integrated(np.linalg.norm(self.mean, axis=2))[:, -1].max()
-        return float(self.spacing.max() / max(whole, nothing_T * self.lines.length))
+        return float(self.spacing[0].max() / max(whole, nothing_T * self.lines.length))
 
     @property
     def spacing_in_words(self) -> str:
@@ -217,14 +217,11 @@ class FieldOnLines(ShownInNotebook):
         if self.relative_spacing <= known:
             return ""
         return (f"the {self.lines.count} points of a line are too far apart, which makes an error "
-                f"of {self.spacing.max():.2g} T m, {self.spacing_in_words}")
+                f"of {self.spacing[0].max():.2g} T m, {self.spacing_in_words}")
 
     def _integrated(self, values: Floats, order: int = 1) -> Floats:
         """Return the integrals (lines, count, ...) from the start of a line to every point."""
-        step = self.lines.length / (self.lines.count - 1)
-        for _ in range(order):
-            values = cumulative_simpson(values, dx=step, axis=1, initial=0.0)
-        return np.asarray(values)
+        return _integrated(values, self.lines.length / (self.lines.count - 1), order, axis=1)
 
     @cached_property
     def _across(self) -> tuple[Floats, Floats]:
@@ -236,7 +233,7 @@ class FieldOnLines(ShownInNotebook):
         integrals = self._integrated(np.concatenate([self.mean[..., None], self.root], axis=3))
         return (np.einsum("lncq,ac->lnaq", integrals, self.lines.axes[:2]),
                 self._integrated(self.error) @ np.abs(self.lines.axes[:2].T)
-                + self.spacing[:, None, None])
+                + self.spacing[0][:, None, None])
 
     def kick_potential(self) -> tuple[Floats, Floats]:
         """Return Phi (lines,) in T^2 m^3 and its standard deviation, linearized at the mean."""
@@ -422,7 +419,7 @@ class _Beside:
             bar[self.number] = np.abs(change[..., 0]) + faster * rate * error[self.number]
         if len(self.number):
             spacing[self.number] = _spacing_error(
-                magnet, lines, values[self.number, ..., 0], self)
+                magnet, lines, values[self.number, ..., 0], self)[0]
         return Slope(values, bar, spacing)
 
 
@@ -455,20 +452,22 @@ def _check_faces(magnet: Magnet, lines: Lines) -> None:
 def _spacing_error(
     magnet: Magnet, lines: Lines, mean: Floats, beside: _Beside | None = None
 ) -> Floats:
-    """Return in T m what the spacing of the points makes of the first integral of lines (lines,).
+    """Return what the spacing of the points makes of the first and second integrals of lines.
 
-    The field of blocks and external sources is integrated over more points. What permeability and
-    iron add to it in ``mean`` (lines, count, 3) is known at these points alone, of which every
-    second one is left out. With ``beside`` it is that of the derivative of B along u, in T.
+    It is (2, lines), in T m and T m^2. The field of blocks and external sources is integrated over
+    more points. What permeability and iron add to it in ``mean`` (lines, count, 3) is known at
+    these points alone, of which every second one is left out. With ``beside`` it is that of the
+    derivative of B along u, in T and T m.
     """
     fewest = 200  # steps, which are enough across a gap of some mm
-    finer = int(np.clip(np.ceil(fewest / (lines.count - 1)), 2, 10))
+    finer = max(2, int(np.ceil(fewest / (lines.count - 1))))
     dense = replace(lines, count=finer * (lines.count - 1) + 1)
     step = dense.length / (dense.count - 1)
 
-    def change(values: Floats, every: int, step: float) -> float:
-        return float(np.abs(simpson(values, dx=step, axis=0)
-                            - simpson(values[::every], dx=every * step, axis=0)).max())
+    def change(values: Floats, every: int, step: float) -> Floats:
+        return np.array([np.abs(
+            _integrated(values, step, order)[-1]
+            - _integrated(values[::every], every * step, order)[-1]).max() for order in (1, 2)])
 
     def exact(points: Floats) -> Floats:
         flux = field_of(magnet.blocks, points) + external_field(magnet, points)
@@ -490,7 +489,14 @@ def _spacing_error(
         added = (own - flux[::finer])[:lines.count - 1 + lines.count % 2]
         found.append(change(flux, finer, step) + (0.0 if magnet.is_vacuum else change(
             added, 2, finer * step)))
-    return np.array(found)
+    return np.transpose(found)
+
+
+def _integrated(values: Floats, step: float, order: int, axis: int = 0) -> Floats:
+    """Return the integrals of values, `order` times, from the first point to every point."""
+    for _ in range(order):
+        values = cumulative_simpson(values, dx=step, axis=axis, initial=0.0)
+    return np.asarray(values)
 
 
 def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:

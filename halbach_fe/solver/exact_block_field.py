@@ -624,13 +624,14 @@ def _filaments(
     return np.array(shares), np.array(found)
 
 
-def current_elements(coil: AnyCoil, longest: float) -> tuple[Floats, Floats]:
+def current_elements(coil: AnyCoil, longest: float, most: int) -> tuple[Floats, Floats]:
     """Return places (n, 3) in m of pieces of a coil and I dl (n, 3) in A m, for forces on it.
 
     Pieces are at most ``longest`` in m, and Gauss points of the section as near to each other in
-    the mean; both are larger where there would be too many.
+    the mean; both are larger where there would be more than ``most`` or so. Those of a circle are
+    equal parts of it, whose sum converges faster than any power of their length.
     """
-    most, part = 40_000, 1 / 100  # number of pieces, and part of a turn that one may be
+    part = 1 / 100  # of a turn that a piece may be
     sides = (0.0, 0.0) if coil.kind == "polygon" else coil.section_m
     if coil.kind == "round":
         line = coil.radius_m * unit_circle(np.linspace(0, 2 * np.pi, 101))
@@ -650,12 +651,12 @@ def current_elements(coil: AnyCoil, longest: float) -> tuple[Floats, Floats]:
     elif coil.kind == "racetrack":
         shares, turns = _filaments(coil, 12, (across, along))
     else:
-        angle = np.linspace(0, 2 * np.pi, round(turn / piece) + 1)
-        circle = unit_circle(angle)
-        # a polygon of the same area
-        circle *= np.sqrt(angle[1] / np.sin(angle[1]))
+        angle = np.linspace(0, 2 * np.pi, int(np.ceil(turn / piece - 1e-9)) + 1)
+        # a polygon whose sides touch the circle in their middles, and are as long as its arcs
+        circle = unit_circle(angle) / np.cos(angle[1] / 2)
         rules = _gauss(sides[0], across), _gauss(sides[1], along)
         shares = np.outer(*(rule[1] for rule in rules)).ravel()
+        shares *= angle[1] / 2 / np.tan(angle[1] / 2)
         turns = [(coil.radius_m + off) * circle + np.array([0.0, 0.0, height])
                  for off in rules[0][0] for height in rules[1][0]]
     places, currents = [], []

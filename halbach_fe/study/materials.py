@@ -26,7 +26,7 @@ from functools import cache, cached_property
 from importlib import resources
 from importlib.resources.abc import Traversable
 from types import MappingProxyType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, ClassVar, NoReturn
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -630,6 +630,9 @@ class Demagnetization(StudyModel):
     the field of the magnet is that with the losses; see `halbach_fe.solver.moments.solve`.
     The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
     """
+
+    FOUND_IN: ClassVar = (", from the data sheet of the material, or name a grade of which they "
+                          "are known in `array.material`")
 
     # of AlNiCo at least 38e3 A/m; numbers of NdFeB in oersted end at 36e3
     intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=3.6e4, le=5e6)]

@@ -169,10 +169,16 @@ class Study(StudyModel, metaclass=_OfKeys):
     @classmethod
     def _with_grade(cls, given: Any) -> Any:
         """Fill in what grades say about prior, and that of the array about demagnetization."""
-        if not isinstance(given, dict) or not isinstance(array := given.get("array"), dict):
-            return given  # a validated array has been through here
-        values, found = dict(given), grade_of({"material": common_material(array)})
-        prior, sds = values.get("prior", {}), remanence_sds(array)
+        array = given.get("array") if isinstance(given, dict) else None
+        if isinstance(array, Array):  # of a changed study, with a new table perhaps
+            material = array.material
+            sds = {name: grade(name).remanence_sd
+                   for name, is_of_grade in array.grades if name and is_of_grade}
+        elif isinstance(array, dict):
+            material, sds = common_material(array), remanence_sds(array)
+        else:
+            return given
+        values, found, prior = dict(given), grade_of({"material": material}), given.get("prior", {})
         if sds and isinstance(prior, dict) and prior.get("common_mode_sd") is None:
             values["prior"] = {"remanence_sd": sds} | prior
         demagnetization = values.get("demagnetization")

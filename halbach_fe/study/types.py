@@ -251,7 +251,8 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
                    if one["type"] == "missing"]
         errors = [first, *(one for one in errors if one["type"] != "missing")]
         return must_be(", ".join(missing), where, wanted, "nothing",
-                       f"Add the {'keys' if len(missing) > 1 else 'key'}.") + _more(errors)
+                       f"Add the {'keys' if len(missing) > 1 else 'key'}"
+                       f"{getattr(model, 'FOUND_IN', '')}.") + _more(errors)
     elif kind.startswith("union_tag"):  # pydantic locates the table, of which one key says its kind
         name = first["ctx"]["discriminator"].strip("'")
         key, found = f"{key}.{name}", received(value.get(name))

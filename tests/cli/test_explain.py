@@ -155,3 +155,29 @@ def test_each_command_runs_as_far_as_it_is_needed(
         assert used["updated"].endswith("registered/study.registered.toml")
     if "explained" in used:
         assert used["explained"].endswith("diagnosed/study.diagnosed.toml")
+
+
+def test_the_blocks_that_fit_the_diagnosed_study_are_used(study, tmp_path, monkeypatch):
+    """The map shows one more ring than the study, whose blocks were measured."""
+    used = {}
+
+    def answered(arguments):
+        name = arguments.output.name
+        used[name] = str(getattr(arguments, "blocks", ""))
+        arguments.output.mkdir(parents=True)
+        answer = {"check": CHECK, "registered": NEAR, "diagnosed": GOOD}.get(name, BAD)
+        write_record(arguments.output / "page.html", "", answer, (), (), {}, None)
+        if name == "diagnosed":
+            (arguments.output / "blocks.csv").write_text("x")
+        return 0
+
+    for verb in ("check", "infer", "register", "diagnose"):
+        monkeypatch.setitem(VERBS, verb, replace(VERBS[verb], run=answered))
+    monkeypatch.setitem(VERBS, "report", replace(VERBS["report"], run=lambda arguments: 0))
+    for name in ("map.csv", "own.csv"):
+        (tmp_path / name).write_text("x")
+    out = tmp_path / "out"
+    assert main(["explain", str(study), str(tmp_path / "map.csv"), "--blocks",
+                 str(tmp_path / "own.csv"), "-o", str(out)]) == 0
+    assert used["inferred"] == used["diagnosed"] == str(tmp_path / "own.csv")
+    assert used["explained"] == str(out / "diagnosed" / "blocks.csv")

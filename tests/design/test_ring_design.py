@@ -345,6 +345,19 @@ def test_rings_that_stand_elsewhere_are_designed_about_the_origin(session, tmp_p
     assert told["region"]["centre_m"] == [0.0, 0.0, 0.0]
 
 
+@pytest.mark.parametrize(("centre", "said"), [
+    ((0.0, 0.0, 0.0), ""), ((0.0, 0.0, 0.03), ""), ((0.0, 0.0, 1.0), "beyond the end of the rings"),
+    ((0.0, 0.0, -0.4), "beyond the end"), ((0.4, 0.0, 0.0), "outside of the bore")])
+def test_a_region_off_the_rings_is_no_yes(designed, centre, said):
+    """It was "Yes", of a stray field. The first two are the control."""
+    found = replace(designed, region=Region.sphere(0.01, centre))
+    told = answer(found)
+    assert told.trust.startswith("No. The middle of the region is" if said else "Yes")
+    assert said in told.trust
+    assert told.sound == (not said)
+    assert ("--centre-m" in told.step) == bool(said)
+
+
 def test_one_type_of_blocks_remains_one():
     """A study whose slots are all of one type has one type in any rings, so that `sort` works."""
     one = parse_study(DOCUMENT | {"prior": {"types": {"cube": list(range(1, 17))}}})

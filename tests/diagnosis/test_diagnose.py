@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import magpylib
@@ -20,7 +19,7 @@ from halbach_fe.diagnosis.effect_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Parameter, Place
 from halbach_fe.diagnosis.effects.magnetization import BlocksSwappedEffect
-from halbach_fe.diagnosis.gross_error_correction import beside_amplitudes
+from halbach_fe.diagnosis.gross_error_correction import beside_amplitudes, blocks_of
 from halbach_fe.diagnosis.random_errors import Outlier
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scanned_maps import Campaign
@@ -363,8 +362,7 @@ def test_only_what_leads_back_and_has_rivals_is_given_up():
 
 def test_blocks_of_another_number_of_rings_lose_their_places(generator, monkeypatch):
     """In the update after a diagnosis that has corrected it, as in the diagnosis itself."""
-    table = table_of(STUDY, drawn(STUDY, generator), generator)
-    table = replace(table, type=("block",) * len(table))
+    table = table_of(STUDY, drawn(STUDY, generator), generator)  # which states no types
     for rings in (1 + STUDY.array.rings, STUDY.array.rings):  # the second one is the control
         steps = explanation._InMemory(
             build_magnet(STUDY), None, explanation.NOT_KEPT, table, lambda text: None)
@@ -374,3 +372,16 @@ def test_blocks_of_another_number_of_rings_lose_their_places(generator, monkeypa
             changes_study=True, said="", trust="", sound=True))
         assert steps.diagnose()
         assert steps.blocks.ring.any() == (rings == STUDY.array.rings)
+        assert len(prior_from_blocks(steps.magnet, steps.blocks).types) == (
+            STUDY.array.blocks_per_ring)
+
+
+@pytest.mark.parametrize("more", [1, -1])
+def test_blocks_of_the_corrected_number_of_rings_keep_their_places(more, generator):
+    """The study as first written has another number, and says so of the table."""
+    true = STUDY.with_(array__rings=STUDY.array.rings + more)
+    table = table_of(true, drawn(true, generator), generator)
+    kept = blocks_of(table, STUDY, true)
+    assert prior_from_blocks(build_magnet(true), kept).placed
+    with pytest.raises(MeasurementError, match=r"rings and blocks of \[array\] in the study"):
+        prior_from_blocks(build_magnet(STUDY), table)

@@ -33,6 +33,7 @@ from halbach_fe.diagnosis.summary import (
 )
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.report.diagnosis_page import change_table, found_table
@@ -41,6 +42,7 @@ from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
+from tests.diagnosis.campaign import STUDY, drawn, table_of
 from tests.support.pages import write_result
 from tests.support.short_dipole import TEXT
 
@@ -311,6 +313,21 @@ def test_the_page_of_what_is_unknown(flat, tmp_path):
     assert answer(replace(found, identified=(), after=found.before, unknown=look)).headline == (
         "Something outside the catalogue is missing. It looks like an error of 0.1 mm rms of the "
         "probe's position along z.")
+
+
+def test_blocks_of_other_rings_than_the_map_shows_are_written_as_samples(flat, generator, tmp_path):
+    """The command that goes on gets them. Negative control: blocks of the rings that it shows."""
+    found, _ = flat
+    table = table_of(STUDY, drawn(STUDY, generator), generator)
+    page = page_of_diagnosis(found, (), STUDY, table)
+    assert page.answer.command.endswith(" --blocks DIR/blocks.csv -o DIR")
+    page.files["blocks.csv"](tmp_path / "blocks.csv")
+    written = read_blocks(tmp_path / "blocks.csv")
+    assert not written.ring.any()
+    assert written.type == tuple(str(slot) for slot in table.slot)
+    own = page_of_diagnosis(replace(found, study=STUDY), (), STUDY, table)
+    assert not own.files
+    assert "--blocks" not in own.answer.command
 
 
 def test_numbers_for_people(flat):

@@ -222,6 +222,11 @@ def test_a_map_of_half_the_field_is_no_map_of_the_magnet(magnet, generator, tmp_
     assert "times the field" not in unlike.trust
     assert "not like the field expected of the magnet" in unlike.trust
     assert "factor" not in unlike.step
+    # a probe that is none, in a pose that explains nothing, is nothing to diagnose with
+    nothing = replace(half[0], likeness=0.1, chi2=34.0)
+    assert answer([nothing]).command.startswith("halbach-fe diagnose STUDY")
+    assert answer([replace(nothing, doubts=())]).command.startswith(
+        "halbach-fe diagnose DIR/study.registered.toml")  # the control
     assert half[0].likeness > 0.9  # 0.98 by the noise
     assert USE_ANY not in said.trust
     summary = registration_summary(half)["poses"][0]

@@ -7,7 +7,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import field_map, read_map
+from halbach_fe.measurement.field_map import field_map, read_map, with_total_field
 from halbach_fe.measurement.formats.import_export import HEADER, read_calibration
 
 ERRORS = {"x": [0.3, -0.1, 0.2], "y": [0.0, 0.05, -0.4], "z": [0.1, 0.1, 0.1]}
@@ -43,6 +43,23 @@ def test_readings_are_corrected(tmp_path, generator, unit):
     np.testing.assert_allclose(corrected["B_T"].values, field, atol=1e-12)
     assert np.abs(data["B_T"].values - field).max() > 2e-3
     assert corrected.attrs["calibrated_by"] == "probe.csv"
+
+
+@pytest.mark.parametrize(("digits", "own"), [(None, True), (5, True), (5, False), (None, False)])
+def test_the_length_of_the_readings_is_corrected_with_them(tmp_path, generator, digits, own):
+    """A meter writes |B| of what its sensors read, also in mT with two digits. What another probe
+    has read, here NMR 0.1 % off that length and right, stays as it is.
+    """
+    field = generator.uniform(-0.8, 0.8, (50, 3))
+    read = shown(field)
+    total = np.linalg.norm(read if own else field, axis=1)
+    if digits is not None:
+        read, total = read.round(digits), total.round(digits)
+    data = with_total_field(field_map(generator.uniform(-0.1, 0.1, (50, 3)), read), total)
+    corrected = read_calibration(table(tmp_path / "probe.csv")).corrected(data, "map.csv")
+    np.testing.assert_allclose(corrected["Babs_T"].values, np.linalg.norm(
+        corrected["B_T"].values, axis=1) if own else total, rtol=1e-12)
+    assert np.abs(np.linalg.norm(read, axis=1) - np.linalg.norm(field, axis=1)).max() > 1e-3
 
 
 def test_the_command_corrects_before_it_writes(tmp_path, capsys):

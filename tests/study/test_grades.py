@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from scipy import stats
 
-from halbach_fe.core.errors import HalbachWarning
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.magnets import magnet_of_blocks, write_study
 from halbach_fe.study import materials as module
 from halbach_fe.study.materials import Demagnetization, check_grade, grade, grades, read_grades
@@ -297,3 +297,27 @@ def test_a_strength_beside_free_blocks_alone_is_doubted():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         magnet.with_(array__material="N52")
+
+
+def test_a_new_table_has_what_the_grade_says_as_in_a_file():
+    """It asked for the coefficients of a grade that it knew, and a new prior lost its remanences.
+    A grade that lacks them asks for them alone, and does with them.
+    """
+    new = {"demagnetization": {"temperature_C": 80.0}, "prior": {"direction_sd_deg": 0.5}}
+    base = {"name": "cubes", "mesh": {"block_size_m": 0.01}, "observation": {
+        "quantity": "flux_density", "positions": {"kind": "points", "points_m": [[0, 0, 0]]}}}
+    for ring in ({}, {"ring": [{"material": "N42"}, {"material": "N35"}]}):
+        array = {"array": CUBES | {"material": "N42"} | ring}
+        plain, told = parse_study(base | array), parse_study(base | array | new)
+        found = plain.with_(**new)
+        assert found.demagnetization == told.demagnetization
+        assert found.prior == told.prior
+        assert found.prior.remanence_sd
+        assert found.prior.direction_sd_deg == 0.5
+    lacking = parse_study(base | {"array": CUBES | {"material": "N42UH"}})
+    with pytest.raises(StudyError, match="coercivity_coefficient_per_K` of changed Study must be "
+                       r"given; .*, from the data sheet of the material, or name a grade"):
+        lacking.with_(**new)
+    both = {"coercivity_coefficient_per_K": -0.006, "remanence_coefficient_per_K": -0.0012}
+    followed = lacking.with_(demagnetization=new["demagnetization"] | both).demagnetization
+    assert followed.coercivity_coefficient_per_K == -0.006

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
     TO_METRES,
+    TOTAL_COLUMN,
+    TOTAL_SIGMA_COLUMN,
     checked_readings,
     doubt_of_metres,
     labelled_map,
@@ -29,6 +32,7 @@ from halbach_fe.measurement.field_map import (
     save_map,
     warn_of_left_out,
     warn_of_millimetres,
+    with_total_field,
 )
 from halbach_fe.measurement.formats import comsol, delimited_table, g4beamline, openpmd, paraview
 from halbach_fe.measurement.formats.columns_to_map import ForeignTable, ImportedMap, to_map
@@ -271,6 +275,8 @@ class Calibration:
     def corrected(self, data: xr.Dataset, where: str) -> xr.Dataset:
         """Return a map, in T along the axes of the probe, with its readings corrected.
 
+        Of them |B| too, where it is their length but for rounding; else another probe has read it.
+
         Raises
         ------
         MeasurementError
@@ -297,8 +303,24 @@ class Calibration:
                     f"{at[0]:.4g} to {at[-1]:.4g} T",
                     "Use a calibration with that range, or check the unit of the map."))
             field[:, number] = shown / (1 + np.interp(shown, at, error))
+        if TOTAL_COLUMN in data and _is_length(data[TOTAL_COLUMN].values, data["B_T"].values):
+            sigma = data.get(TOTAL_SIGMA_COLUMN)
+            data = with_total_field(data, np.linalg.norm(field, axis=1),
+                                    None if sigma is None else sigma.values)
         return data.assign(B_T=(data["B_T"].dims, field, data["B_T"].attrs)).assign_attrs(
             calibrated_by=self.name, calibration_sha256=self.sha256)
+
+
+def _is_length(total: Floats, field: Floats) -> bool:
+    """Tell whether numbers (n,) are the lengths of vectors (n, 3), as far as both are rounded."""
+    def step(values: Floats) -> float:
+        return next((10.0 ** -digits for digits in range(sys.float_info.dig) if np.allclose(
+            np.round(values, digits), values, rtol=1e-12, atol=0, equal_nan=True)), 0.0)
+
+    length = np.linalg.norm(field, axis=1)
+    off = 1e-12 * length + step(total) / 2 + np.sqrt(3) * step(field) / 2
+    known = np.isfinite(total)
+    return bool(known.any() and (np.abs(total - length) <= off)[known].all())
 
 
 def read_calibration(path: Path) -> Calibration:
