@@ -19,7 +19,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Prism, at_heights, upright
-from halbach_fe.geometry.symmetry import as_meant, mountings
+from halbach_fe.geometry.remounting import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array_keys import block_name
