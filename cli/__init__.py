@@ -10,9 +10,9 @@ from collections.abc import Sequence
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the verb of a command line; return its exit code, see `EXIT_CODES` in core.errors."""
     try:
-        from halbach_fe.cli import guard, verbs
+        from halbach_fe.cli import process, verbs
 
-        return guard.guarded(lambda: verbs.run(sys.argv[1:] if argv is None else argv))
+        return process.guarded(lambda: verbs.run(sys.argv[1:] if argv is None else argv))
     except KeyboardInterrupt:
         if sys.stderr is not None:
             sys.stderr.write("interrupted\n")

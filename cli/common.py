@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import halbach_fe as hf
-from halbach_fe.cli.guard import claim_buffers, guarded, show
-from halbach_fe.cli.guard import say as say
+from halbach_fe.cli.process import claim_buffers, guarded, show
+from halbach_fe.cli.process import say as say
 from halbach_fe.cli.shared_options import (
     SOLVER,
     Options,

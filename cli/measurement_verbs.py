@@ -472,15 +472,17 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
         common.print_json(estimate.as_dict())
         return 0
     from halbach_fe.core.progress import duration
+    from halbach_fe.report.words import counted
     from halbach_fe.response.resource_estimate import TIME_FACTOR
 
     common.print_estimate(estimate.update, as_json=False)
     rounds = estimate.as_dict()["rounds"]
     times = " to ".join(map(duration, (estimate.shortest_s, estimate.longest_s)))
     common.say(f"That is one round; a diagnosis that finds something takes {rounds[0]} to "
-               f"{rounds[1]}. The first one compares {estimate.signatures} hypotheses, which need "
-               f"{estimate.fields} more fields of whole magnets. In all {times}, within a factor "
-               f"of about {TIME_FACTOR:g}.")
+               f"{rounds[1]}. The first one compares "
+               f"{counted(estimate.signatures, 'hypothesis', 'hypotheses')}, for which it solves "
+               f"{counted(estimate.fields, 'more field')} of whole magnets. In all {times}, within "
+               f"a factor of about {TIME_FACTOR:g}.")
     return 0
 
 

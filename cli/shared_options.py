@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from halbach_fe.cli.guard import say, show
+from halbach_fe.cli.process import say, show
 from halbach_fe.core.errors import EXIT_CODES, MAX_QUOTED, printable
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.installation import version

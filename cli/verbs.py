@@ -20,7 +20,7 @@ import shtab
 
 import halbach_fe as hf
 from halbach_fe.cli import common, file_verbs, magnet_verbs, measurement_verbs
-from halbach_fe.cli.guard import show
+from halbach_fe.cli.process import show
 from halbach_fe.cli.shared_options import CACHE_HELP, GETDP, JSON, choice, option, path, verb
 from halbach_fe.cli.shared_options import VERBS as VERBS
 from halbach_fe.cli.shared_options import parser as parser

@@ -27,7 +27,7 @@ from halbach_fe.geometry.outline import (
     points_on,
     upright,
 )
-from halbach_fe.geometry.symmetry import as_meant, mountings
+from halbach_fe.geometry.remounting import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array_keys import block_name

@@ -48,8 +48,8 @@ from halbach_fe.solver.routes import check_points, field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.posteriors import posterior
-from halbach_fe.study.inference_keys import Inference, InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.inference_keys import Inference
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,9 @@ from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Known, Objective
-from halbach_fe.design.remounting import Mounts, mounts_of
 from halbach_fe.design.sorting import Slots
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import as_meant, remounted
+from halbach_fe.geometry.remounting import Mounts, as_meant, mounts_of, remounted
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
@@ -203,7 +202,7 @@ class SpareBlocks:
 
     names: tuple[str, ...]
     mean: Floats
-    """Means of the magnetizations in own axes (see `halbach_fe.design.remounting`).
+    """Means of the magnetizations in own axes (see `halbach_fe.geometry.remounting`).
     Shape (n, 3), in A/m."""
     covariance: Floats
     """Covariances of the magnetizations in own axes. Shape (n, 3, 3), in A^2/m^2."""

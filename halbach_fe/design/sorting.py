@@ -36,9 +36,8 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.interface import ShownInNotebook
 from halbach_fe.core.progress import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
-from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import as_meant, rotation_deg
+from halbach_fe.geometry.remounting import LARGEST_ANGLE, Mounts, as_meant, mounts_of, rotation_deg
 from halbach_fe.inference.block_prior import (
     as_mounted,
     first_of_types,

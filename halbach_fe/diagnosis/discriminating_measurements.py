@@ -45,8 +45,7 @@ from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import NoiseCovariance, independent_noise
-from halbach_fe.study.inference_keys import PROBE_KEYS
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import PROBE_KEYS, Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

@@ -23,8 +23,7 @@ from halbach_fe.diagnosis.random_errors import Outlier, PositionNoise
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.study.inference_keys import InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.model import Study
 
 

@@ -33,7 +33,7 @@ from halbach_fe.measurement.probe_law import (
     probe_points,
     sensor_matrix,
 )
-from halbach_fe.study.inference_keys import POSE_KEYS, PROBE_KEYS
+from halbach_fe.study.measurement_keys import POSE_KEYS, PROBE_KEYS
 from halbach_fe.study.model import Study
 
 FieldAt = Callable[[Study, Floats], Floats]

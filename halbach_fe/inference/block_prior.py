@@ -30,7 +30,7 @@ from halbach_fe.core.interface import ShownInNotebook, typed
 from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import as_meant, mountings
+from halbach_fe.geometry.remounting import as_meant, mountings
 from halbach_fe.measurement.block_table import REMANENT, BlockTable
 from halbach_fe.solver.exact_block_field import remanence_per_polarization
 from halbach_fe.stats.gaussian import (

@@ -15,8 +15,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.measurement.map_check import DETERMINED
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.inference_keys import InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.model import Study
 
 DEGREES = ("shift along x", "shift along y", "shift along z",

@@ -28,7 +28,7 @@ from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Res
 from halbach_fe.measurement.probe_law import row_order_note
 from halbach_fe.response.block_variation import distribution_of, magnetized
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
-from halbach_fe.study.inference_keys import InstrumentSd
+from halbach_fe.study.measurement_keys import InstrumentSd
 from halbach_fe.study.model import Study, differences, magnet_description
 
 

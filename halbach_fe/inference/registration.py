@@ -43,8 +43,7 @@ from halbach_fe.measurement.map_join import MapPose
 from halbach_fe.measurement.probe_law import turn_of
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.inference_keys import POSE_KEYS, PROBE_KEYS, InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import POSE_KEYS, PROBE_KEYS, Instrument, InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 

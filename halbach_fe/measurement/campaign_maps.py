@@ -30,7 +30,7 @@ from halbach_fe.measurement.formats.import_export import refuse_units_twice
 from halbach_fe.measurement.observation_operator import study_for_validation_map
 from halbach_fe.measurement.positions import follows_times
 from halbach_fe.measurement.probe_law import in_si_and_magnet_axes, turn_of
-from halbach_fe.study.inference_keys import InstrumentSd
+from halbach_fe.study.measurement_keys import InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, MIN_SIGMA_T
 

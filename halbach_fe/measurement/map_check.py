@@ -500,7 +500,7 @@ def check_map(
     matrix, alike, placed = _confirmed(matrix, alike, scan.of(rows.few), some, pace)
     fitted = _first_fit(scan.turned(matrix), placed, rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
-    fitted, terms = _stated(fitted, scan, rows.train, pace)
+    fitted, terms = _instrument_of_map(fitted, scan, rows.train, pace)
     terms = _beside_likes(fitted, terms)
     _begin(pace, 5, "fitting all scan lines")
     whole, fitted, rows = _without_spikes(fitted, rows, broken)
@@ -511,7 +511,7 @@ def check_map(
         order=_order(data),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=placed.gap_m,
+        corrected_T=fitted.model.ideal(_without_open_terms(fitted, terms)), gap_m=placed.gap_m,
         **_remaining(fitted, whole, scan, matrix, rows))
 
 
@@ -1112,7 +1112,7 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     return found
 
 
-def _stated(
+def _instrument_of_map(
     fitted: _Fitted, scan: Scan, rows: NDArray[np.bool_], pace: Pace
 ) -> tuple[_Fitted, tuple[InstrumentTerm, ...]]:
     """Return the fit by what the map shows of the instrument, and what it shows.
@@ -1136,7 +1136,7 @@ def _stated(
         def advance(done: int, of: int, before: int = number) -> None:
             pace.advance(before * of + done, len(regions) * of)
 
-        asked.append(_asked(start, region, advance))
+        asked.append(_instrument_of_region(start, region, advance))
     supported = [np.array([term.found and (number == 0 or _is_supported(term, others))
                            for term, *others in zip(terms, *(
                                other for _, other in asked[:number] + asked[number + 1:]),
@@ -1154,7 +1154,7 @@ def _stated(
     return settled.weighted(rows), terms
 
 
-def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
+def _without_open_terms(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
     """Return the fit without the parameters of which the map does not tell which is off, and those
     whose bar other regions made too long, but for those, such as parts of a change, that one which
     was found has as well.
@@ -1196,7 +1196,7 @@ def _with_other_regions(term: InstrumentTerm, others: list[InstrumentTerm]) -> I
         term.likes_sd, *(other.likes_sd if other.found else np.inf for other in others)))
 
 
-def _asked(
+def _instrument_of_region(
     fitted: _Fitted, rows: NDArray[np.bool_], advance: Progress
 ) -> tuple[_Fitted, tuple[InstrumentTerm, ...]]:
     """Return the fit by what all parts of a region show of the instrument, and what they show.
@@ -1221,7 +1221,7 @@ def _asked(
             advance(done + len(told), ROUNDS * steps)
         parameters = [replace(one, row=0 * one.row) if one.name in unsteady else one
                       for one in all_parameters(model.prior_sd, model.shares(fitted.at))]
-        kept, terms = selected(parameters, EvidenceByPart.of(
+        kept, terms = found_terms(parameters, EvidenceByPart.of(
             told, list(halves).index("steepness") if "steepness" in halves else None))
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
         advance(done + steps, ROUNDS * steps)
@@ -1247,7 +1247,7 @@ def _as_fitted(term: InstrumentTerm, value: float) -> InstrumentTerm:
     return replace(term, value=value, sd=float(np.hypot(term.sd, value - term.value)))
 
 
-def selected(
+def found_terms(
     parameters: list[Parameter], told: EvidenceByPart, known: NDArray[np.bool_] | None = None,
     with_rivals: bool = True,
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:

@@ -45,10 +45,10 @@ from halbach_fe.measurement.map_check import (
     Scan,
     all_parameters,
     check_map,
+    found_terms,
     inner,
     oriented,
     scan_of,
-    selected,
     some_lines,
 )
 from halbach_fe.measurement.map_join_fit import (
@@ -775,7 +775,7 @@ class _Joined:
                 list(self._evidence(open_terms, self._overlap, self._halves())))
             # that one probe or its electronics has another gain in a map is likelier than anything
             # else that differs between maps, whatever the overlap alone can tell
-            new, _ = selected(parameters, told, kept, with_rivals=False)
+            new, _ = found_terms(parameters, told, kept, with_rivals=False)
             for number in range(1, len(self.maps)):  # those of components leave that of |B|
                 gains = _gains_of(self.model, number)
                 new[gains[0]] |= (new & ~kept)[gains[1:]].any()

@@ -41,8 +41,7 @@ from halbach_fe.measurement.field_map import (
     refuse_undirected,
 )
 from halbach_fe.measurement.positions import motion
-from halbach_fe.study.inference_keys import InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

@@ -15,7 +15,7 @@ from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import as_meant, is_as_meant
+from halbach_fe.geometry.remounting import as_meant, is_as_meant
 from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import COMPONENTS
 

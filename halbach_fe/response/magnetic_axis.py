@@ -108,33 +108,16 @@ def magnetic_axis(
         None if the nominal magnet has no main multipole, or the middle of the bore is not free.
     """
     magnetizations = distribution_of(magnet, magnetizations, "magnetizations").stacked
-    flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius
-    radius, middle = RADIUS * bore, np.array(magnet.middle_m)
-    reach = 0.0 if flat else LENGTH * (magnet.array_half_length - abs(middle[2]))
-    heights = np.zeros(1) if flat else np.linspace(-reach, reach, HEIGHTS)  # from the middle
-    count = 2 * (order + 2)
-    angles = 2 * np.pi * np.arange(count) / count
-    circle = radius * unit_circle(angles)
-    around = (circle + heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
-    # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
-    sphere = bore / 4 * _ON_SPHERE
-    points = middle + (np.vstack([around, sphere]) if order == 1 and not flat else around)
-    if magnet.contains(points).any() or _has_source(
-            magnet, bore / 4, middle + heights[:, None] * [0, 0, 1.0]):
+    order, bore, circles = magnet.array.multipole_order, magnet.bore_radius, _Circles.of(magnet)
+    in_3d, points = magnet.dimension == 3, circles.points
+    if order == 1 and in_3d:  # a dipole's field is expanded on a sphere
+        points = np.vstack([points, circles.middle + bore / 4 * _ON_SPHERE])
+    if magnet.contains(points).any() or _has_source(magnet, bore / 4, circles.axis):
         return None  # something stands in the bore
-    size = magnet.dimension
     field, nominal, columns = (
-        values[:, :size] for values in _fields(magnet, points, session, magnetizations.mean))
-    on_circles = slice(0, len(around))
-
-    def multipole(number: int, values: Floats) -> Complexes:
-        """Return C (heights, ...) of an order from values (points, 2 or 3, ...) of the field."""
-        parts = values[on_circles].reshape(len(heights), count, size, *values.shape[2:])
-        wave = np.exp(-1j * (number - 1) * angles) / count
-        return np.einsum("hp...,p->h...", parts[:, :, 1] + 1j * parts[:, :, 0], wave)
-
-    main, root = multipole(order, field), multipole(order, columns)
-    was = multipole(order, nominal)
+        values[:, :magnet.dimension]
+        for values in _fields(magnet, points, session, magnetizations.mean))
+    was, main, root = (circles.multipole(order, values) for values in (nominal, field, columns))
     if not np.abs(was).max() > NOTHING_THERE * np.abs(root).sum(axis=1).max() * np.abs(
             magnet.nominal_magnetization).max():
         return None
@@ -143,26 +126,73 @@ def magnetic_axis(
     roll = float(-np.angle(total)) / order
     roll_row = -(np.conj(total) * (np.conj(was) @ root)).imag / abs(total)**2 / order
     roll_sd = float(magnetizations.sd_of(roll_row[None])[0])
-    if order == 1:
-        if flat:
-            return MagneticAxis(order, roll, roll_sd)
-        centre = _stationary(
-            field[len(around):], columns[len(around):], bore / 4, middle, magnetizations)
-        return MagneticAxis(order, roll, roll_sd, *centre)
-    below, below_root = multipole(order - 1, field), multipole(order - 1, columns)
-    scale = -radius / (order - 1)
-    places = middle[:2] @ [1, 1j] + scale * below / main  # x0 + i y0 at each height
-    place_rows = scale * (below_root - (below / main)[:, None] * root) / main[:, None]
-    design = np.column_stack([np.ones_like(heights), heights])[:, :1 if flat else 2]
-    fit = np.linalg.pinv(design)
-    line = fit @ places
-    rows = fit @ place_rows
+    if order > 1:
+        line, rows = _line(circles, order, field, columns)
+        return MagneticAxis(order, roll, roll_sd, *(
+            each for place, row in zip(line.tolist(), rows, strict=True)
+            for each in ((place.real, place.imag), tuple(magnetizations.sd_of(
+                np.vstack([row.real, row.imag])).tolist()))))
+    return MagneticAxis(order, roll, roll_sd, *(_stationary(
+        field[-len(_ON_SPHERE):], columns[-len(_ON_SPHERE):], bore / 4, circles.middle,
+        magnetizations) if in_3d else ()))
 
-    def both(number: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        sd = magnetizations.sd_of(np.vstack([rows[number].real, rows[number].imag]))
-        return (float(line[number].real), float(line[number].imag)), tuple(sd.tolist())
 
-    return MagneticAxis(order, roll, roll_sd, *both(0), *(() if flat else both(1)))
+@dataclass(frozen=True)
+class _Circles:
+    """Circles about the axis of a magnet, and the multipoles of the field on them."""
+
+    middle: Floats
+    """Of the magnet."""
+    radius: float
+    heights: Floats
+    """Along z from the middle; 0 alone in a cross-section. In m."""
+    angles: Floats
+
+    @classmethod
+    def of(cls, magnet: Magnet) -> _Circles:
+        middle, heights = np.array(magnet.middle_m), np.zeros(1)
+        if magnet.dimension == 3:
+            reach = LENGTH * (magnet.array_half_length - abs(middle[2]))
+            heights = np.linspace(-reach, reach, HEIGHTS)
+        count = 2 * (magnet.array.multipole_order + 2)
+        return cls(middle, RADIUS * magnet.bore_radius, heights,
+                   2 * np.pi * np.arange(count) / count)
+
+    @property
+    def axis(self) -> Floats:
+        """Their middles (heights, 3) in m."""
+        return self.middle + self.heights[:, None] * [0, 0, 1.0]
+
+    @property
+    def points(self) -> Floats:
+        """Points (heights * angles, 3) in m."""
+        circle = self.radius * unit_circle(self.angles)
+        return self.middle + (circle + self.heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
+
+    def multipole(self, order: int, values: Floats) -> Complexes:
+        """Return C (heights, ...) of an order from the field (points, 2 or 3, ...), of which the
+        first points are these.
+        """
+        shape = len(self.heights), len(self.angles)
+        parts = values[:shape[0] * shape[1]].reshape(*shape, *values.shape[1:])
+        wave = np.exp(-1j * (order - 1) * self.angles) / len(self.angles)
+        return np.einsum("hp...,p->h...", parts[:, :, 1] + 1j * parts[:, :, 0], wave)
+
+
+def _line(
+    circles: _Circles, order: int, field: Floats, columns: Floats
+) -> tuple[Complexes, Complexes]:
+    """Return the line through the centres, x + i y in the middle and, in 3D, its slope, (1 or 2,),
+    and the derivatives (1 or 2, parameters) of these.
+    """
+    (below, main), (below_root, root) = (
+        [circles.multipole(each, values) for each in (order - 1, order)]
+        for values in (field, columns))
+    scale = -circles.radius / (order - 1)
+    places = circles.middle[:2] @ [1, 1j] + scale * below / main  # x0 + i y0 at each height
+    rows = scale * (below_root - (below / main)[:, None] * root) / main[:, None]
+    fit = np.linalg.pinv(np.vander(circles.heights, min(len(places), 2), increasing=True))
+    return fit @ places, fit @ rows
 
 
 def _has_source(magnet: Magnet, radius: float, line: Floats) -> bool:

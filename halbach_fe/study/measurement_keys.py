@@ -1,4 +1,4 @@
-"""Keys of a study that describe the measurement: positions, instrument, noise."""
+"""Keys of a study that describe the measurement: positions, instrument and its priors, noise."""
 
 from __future__ import annotations
 
@@ -98,6 +98,38 @@ class Instrument(StudyModel):
             if {axis[-1] for axis in axes} != set(COMPONENTS):
                 raise ValueError(f"{name} must name x, y and z once each, but is {list(axes)}")
         return self
+
+
+SmallSd = Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False)]
+
+PROBE_KEYS = ("crosstalk", "gain", "sensor_position_m", "planar_hall_per_T", "quadratic_per_T",
+              "cubic_per_T2")
+"""Keys of an instrument that belong to its probe, and may be shared by several maps. All others
+belong to a map: its pose and its stage, and the offsets, which change from day to day."""
+
+POSE_KEYS = ("translation_m", "rotation_rad")
+"""Keys of an instrument that say how a map lies in the magnet."""
+
+
+class InstrumentSd(StudyModel):
+    """Prior standard deviations of the terms of the instrument that are estimated with the blocks.
+
+    A term of which 0 is stated (the default) is exactly what ``instrument`` says. The others are
+    parameters of the update, like the magnetizations, and widen the error bars of these.
+    ``translation_m`` is the standard deviation of the place of the map's middle along each axis of
+    the magnet, ``rotation_rad`` that of the turn of the map about each axis through its middle. The
+    others are those of each component of the instrument's keys of the same name. State what was
+    known without the map, so that the same readings are not counted twice. `halbach-fe register`
+    writes this table: of the pose that it found, at least ten of its error bars.
+    """
+
+    translation_m: PositionSd = 0.0
+    rotation_rad: SmallSd = 0.0
+    crosstalk: SmallSd = 0.0
+    gain: SmallSd = 0.0
+    offset_T: SmallSd = 0.0
+    sensor_position_m: PositionSd = 0.0
+    drift_T: SmallSd = 0.0
 
 
 class LinePositions(StudyModel):

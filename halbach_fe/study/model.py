@@ -24,10 +24,7 @@ from halbach_fe.study.array_keys import Array, common_material, remanence_sds
 from halbach_fe.study.design_keys import Design, Holder, HomogeneityRegion, ShimTray
 from halbach_fe.study.external_keys import External
 from halbach_fe.study.inference_keys import (
-    POSE_KEYS,
-    PROBE_KEYS,
     Inference,
-    InstrumentSd,
     MapSettings,
     Plan,
     Prior,
@@ -36,7 +33,14 @@ from halbach_fe.study.inference_keys import (
 )
 from halbach_fe.study.iron_keys import Iron, IronCurve, IronRing
 from halbach_fe.study.materials import Curve, Demagnetization, grade, grade_of
-from halbach_fe.study.measurement_keys import Instrument, NoiseSettings, ObservationSettings
+from halbach_fe.study.measurement_keys import (
+    POSE_KEYS,
+    PROBE_KEYS,
+    Instrument,
+    InstrumentSd,
+    NoiseSettings,
+    ObservationSettings,
+)
 from halbach_fe.study.types import (
     COMPONENTS,
     MAX_LENGTH_M,

@@ -172,10 +172,10 @@ def test_every_result_has_a_command():
     from halbach_fe.report.joint_report_folders import ORDER
     from halbach_fe.report.page import PAGES
 
-    named = [re.findall(r' Page\(\s*"([a-z-]+)"', inspect.getsource(
-        importlib.import_module(f"halbach_fe.report.{name}"))) for name in PAGES.values()]
-    assert all(named)
-    assert {verb for verbs in named for verb in verbs} <= set(ORDER) <= set(VERBS)
+    named = {name: re.findall(r' Page\(\s*"([a-z-]+)"', inspect.getsource(
+        importlib.import_module(f"halbach_fe.report.{name}"))) for name in PAGES.values()}
+    assert [name for name, verbs in named.items() if not verbs] == []
+    assert {verb for verbs in named.values() for verb in verbs} <= set(ORDER) <= set(VERBS)
     shown = {name for name in hf.__all__ if isinstance(kind := getattr(hf, name), type)
              and issubclass(kind, ShownInNotebook)}
     assert set(PAGES) == shown - {"Magnet"}  # which has a picture instead

@@ -18,7 +18,7 @@ import pytest
 import tomlkit
 
 from halbach_fe.cli import main
-from halbach_fe.cli.guard import guarded
+from halbach_fe.cli.process import guarded
 from halbach_fe.cli.shared_options import orders
 from halbach_fe.cli.verbs import with_values
 from halbach_fe.core.errors import HalbachWarning, StudyError

@@ -19,7 +19,7 @@ from halbach_fe.core.errors import EXIT_CODES
 from halbach_fe.geo.iron_mesh import Sizes
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import as_meant, mountings
+from halbach_fe.geometry.remounting import as_meant, mountings
 from halbach_fe.inference.block_prior import types_of
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map

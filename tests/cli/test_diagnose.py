@@ -385,7 +385,7 @@ def test_a_dry_run_counts_and_writes_nothing(study, tmp_path, capsys):
     assert 0 < found["seconds"][0] < found["seconds"][1]
     assert main([*arguments, "--effects", "gain_x"]) == 0
     said = capsys.readouterr()
-    assert "compares 1 hypotheses" in said.err
+    assert "compares 1 hypothesis, for which it solves 0 more fields" in said.err
     assert "parameters" in said.out
     assert not out.exists()
 

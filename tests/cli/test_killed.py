@@ -99,14 +99,14 @@ def test_what_waits_is_not_begun_after_an_interrupt(tmp_path):
 
 STUCK = """
 import ctypes, sys
-from halbach_fe.cli import guard
-guard.PATIENCE_S = float(sys.argv[1])
+from halbach_fe.cli import process
+process.PATIENCE_S = float(sys.argv[1])
 def run():
     lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)
     lock(mutex)
     print("locked", flush=True)
     lock(mutex)  # never returns, whatever signal comes
-sys.exit(guard.guarded(run))
+sys.exit(process.guarded(run))
 """
 
 

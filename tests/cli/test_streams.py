@@ -10,12 +10,13 @@ import sys
 import numpy as np
 import pytest
 
-from halbach_fe.cli import guard
-from halbach_fe.cli.guard import guarded
+from halbach_fe.cli import process
+from halbach_fe.cli.process import guarded
 from tests.conftest import ROOT
 
 PROGRAM = f"'{sys.executable}' -m halbach_fe"
-FLAWED = "import sys; from halbach_fe.cli import common, guard; sys.exit(guard.guarded(lambda: {}))"
+FLAWED = ("import sys; from halbach_fe.cli import common, process; "
+          "sys.exit(process.guarded(lambda: {}))")
 POSIX = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
@@ -154,7 +155,7 @@ def raised(error):
     (UnicodeEncodeError(sys.getfilesystemencoding(), "\udce9", 0, 1, "no"), False, 8),
     (UnicodeEncodeError("ascii" * 2, "\xe9", 0, 1, "no"), False, 1)])
 def test_errors_of_the_machine_are_no_bugs(monkeypatch, capsys, error, near, code):
-    monkeypatch.setattr(guard, "_at_the_limit", lambda: near)
+    monkeypatch.setattr(process, "_at_the_limit", lambda: near)
     assert guarded(raised(error)) == code
     said = capsys.readouterr().err
     assert ("Traceback" in said) == (code == 1)
@@ -175,7 +176,7 @@ def test_causes_count(capsys):
 
 def test_the_limit_of_memory():
     """Far from it, and near to it."""
-    code = ("import resource; from halbach_fe.cli.guard import _at_the_limit; "
+    code = ("import resource; from halbach_fe.cli.process import _at_the_limit; "
             "resource.setrlimit(resource.RLIMIT_AS, ({0}, {0})); print(_at_the_limit())")
     for limit, said in ((2**40, "False"), (2**28, "True")):
         done = subprocess.run([sys.executable, "-c", code.format(limit)], capture_output=True,
@@ -185,4 +186,4 @@ def test_the_limit_of_memory():
 
 def test_every_character_has_a_spelling():
     """That is in ASCII."""
-    assert all(text.isascii() for text in guard.SPELLED.values())
+    assert all(text.isascii() for text in process.SPELLED.values())

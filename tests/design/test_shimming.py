@@ -12,11 +12,16 @@ from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.design.remounting import mounts_of, shape_turns
 from halbach_fe.design.shimming import gain, shim, taken_out
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import mountings, remounted, rotation_deg
+from halbach_fe.geometry.remounting import (
+    mountings,
+    mounts_of,
+    remounted,
+    rotation_deg,
+    shape_turns,
+)
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from

@@ -17,7 +17,7 @@ from halbach_fe.diagnosis.linearization import Linearization, NominalSolver, app
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scanned_maps import Campaign
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import mountings, turns_in_slot
+from halbach_fe.geometry.remounting import mountings, turns_in_slot
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.study.reader import parse_study

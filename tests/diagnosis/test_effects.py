@@ -16,7 +16,7 @@ from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.geometry.array_layout import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import mountings, properties
+from halbach_fe.geometry.remounting import mountings, properties
 from halbach_fe.measurement.probe_law import nonlinear_part, probe_points, sensor_model, with_memory
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.study.reader import parse_study

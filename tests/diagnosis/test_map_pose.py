@@ -31,8 +31,7 @@ from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference_keys import InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
 

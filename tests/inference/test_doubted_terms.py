@@ -69,8 +69,7 @@ from halbach_fe.report.registration_page import (
     rivals,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference_keys import InstrumentSd
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.reader import parse_study
 from tests.support import cube_dipole
 from tests.support.cube_dipole import GRID, TEXT, component, noisier

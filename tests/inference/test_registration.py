@@ -49,9 +49,8 @@ from halbach_fe.report.registration_page import (
     stated_odds,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.inference_keys import InstrumentSd
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.measurement_keys import Instrument
+from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
 

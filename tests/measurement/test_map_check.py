@@ -377,9 +377,9 @@ def trust_white_noise(monkeypatch):
     """Let the check believe that whatever the charges do not follow is white noise: the parts of
     the map tell what the whole map does, and its regions do not differ.
     """
-    selected = map_check.selected
+    selected = map_check.found_terms
     monkeypatch.setattr(map_check, "_with_other_regions", lambda term, others: term)
-    monkeypatch.setattr(map_check, "selected", lambda parameters, told, **_: selected(
+    monkeypatch.setattr(map_check, "found_terms", lambda parameters, told, **_: selected(
         parameters, map_check.EvidenceByPart.of([told.whole] * 3)))
 
 
@@ -476,7 +476,7 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(shape, monkeypatch):
     Nothing is wrong with them. The control, of cuboids, does not ask the half in which the field is
     flat: both halves along x and along y are steep somewhere, and in some maps show the same.
     """
-    asked, selected = [], map_check.selected
+    asked, selected = [], map_check.found_terms
     for seed in range(1 if shape is sectors else 4):
         generator = np.random.default_rng(seed)
         field = shape(truth(generator)).getB(FRINGE)
@@ -486,7 +486,7 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(shape, monkeypatch):
         assert not any(term.found for term in check.terms)
         if shape is not sectors:
             with monkeypatch.context() as without:
-                without.setattr(map_check, "selected", lambda parameters, told, **_: selected(
+                without.setattr(map_check, "found_terms", lambda parameters, told, **_: selected(
                     parameters, replace(told, flat=None)))
                 without.setattr(map_check, "_with_other_regions", lambda term, others: term)
                 asked += [term.name for term in check_map(data).terms if term.found]

@@ -149,7 +149,7 @@ def small_texts(code):
 @pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend", "nonsense", "tkagg"])
 def test_the_backend_of_a_notebook_is_not_needed(backend):
     """Which a terminal started from it inherits."""
-    code = ("import sys; from halbach_fe.cli.guard import guarded; "
+    code = ("import sys; from halbach_fe.cli.process import guarded; "
             "sys.exit(guarded(lambda: bool(__import__('halbach_fe.report.page') and 0)))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
                           check=False, env=os.environ | {"MPLBACKEND": backend})

@@ -28,7 +28,13 @@ from halbach_fe.diagnosis.effects.base import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import Move, moves_of_rings, remounted, turns_in_slot, turns_over
+from halbach_fe.geometry.remounting import (
+    Move,
+    moves_of_rings,
+    remounted,
+    turns_in_slot,
+    turns_over,
+)
 from halbach_fe.study.array_keys import BlockException
 from halbach_fe.study.model import Study
 

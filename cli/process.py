@@ -1,5 +1,5 @@
-"""What is around every command: exit codes, signals, want of memory, and the standard streams,
-which may be closed, full, or lack characters.
+"""The process of a command: exit codes, signals, want of memory, and the standard streams, which
+may be closed, full, or lack characters.
 """
 
 from __future__ import annotations
