@@ -52,6 +52,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement_keys import Instrument, InstrumentSd
 from halbach_fe.study.reader import parse_study, read_study
+from tests.diagnosis import campaign as cuboids
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
 
 
@@ -549,3 +550,25 @@ def test_a_probe_that_another_map_has_found_keeps_what_changes_from_map_to_map()
     of_magnitude = SimpleNamespace(total=True, probe=ProbePrior(0.0, 2e-4, 1e-5, 0.0))
     found = _of_known_probe(of_magnitude, InstrumentSd())
     assert found == ProbePrior(gain=2e-4)  # no term without any freedom
+
+
+def test_a_map_beside_neighbouring_magnets_is_found(generator, tmp_path):
+    """The search left out what the study says of them, and refused the map. The second neighbour
+    is reversed, so that the map lies nowhere else; the blocks are magpylib's.
+    """
+    study = cuboids.STUDY.with_(external={"neighbours": [
+        {"z_m": 0.25}, {"z_m": -0.25, "factor": -1.0}]})
+    own, turn = build_magnet(cuboids.STUDY), Rotation.from_euler("x", 180, degrees=True)
+    nominal = np.array([np.array(one.easy_axis) * one.remanence for one in own.blocks])
+    shift = np.array([0.0, 0.0, 0.03])
+    places = turn.apply(cuboids.CIRCLES) + shift
+    shown = turn.inv().apply(sum(
+        factor * cuboids.field(cuboids.STUDY, nominal, places - [0.0, 0.0, z])
+        for z, factor in ((0.0, 1.0), (0.25, 1.0), (-0.25, -1.0))))
+    data = field_map(cuboids.CIRCLES, shown + cuboids.NOISE_T * generator.standard_normal(
+        shown.shape))
+    (found,) = register(build_magnet(study), data, Session.open(tmp_path))
+    assert found.explains
+    assert found.middle_m == pytest.approx(shift, abs=3e-4)
+    with pytest.raises(MeasurementError, match="one that some pose of the magnet explains"):
+        register(own, data, Session.open(tmp_path))  # negative control
