@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
@@ -221,8 +221,13 @@ class _Update:
         matrix = self.matrix if matrix is None else matrix
         mean, sd = predict(matrix, parameters)
         offset = self.model.offset + bent(self.readings, self.vectors, self.model, parameters)
-        return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
+        return Prediction(offset + mean, sd, partial(_root_of, matrix, parameters),
                           parameters.root.shape[1])
+
+
+def _root_of(matrix: Rows, parameters: Gaussian, rows: Ints) -> Floats:
+    """Return rows of a root of the covariance of what a matrix makes of some parameters."""
+    return np.asarray(matrix[rows] @ parameters.root)
 
 
 @dataclass

@@ -87,6 +87,9 @@ class BlockTable:
         return list(zip(self.ring.tolist(), self.slot.tolist(), strict=True))
 
     def __post_init__(self) -> None:
+        for name in ("moment", "sigma", "volume", "temperature", "ring", "slot", "turn_deg"):
+            if (given := getattr(self, name)) is not None:  # lists are taken, too
+                object.__setattr__(self, name, np.asarray(given))
         _check(self)
 
 

@@ -41,6 +41,7 @@ from halbach_fe.report.page import (
 from halbach_fe.report.point_maps import curve, geometry_figure, maps_figure
 from halbach_fe.report.words import (
     ROUNDING,
+    coils_in_words,
     counted,
     decimals,
     flux_density,
@@ -77,9 +78,11 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
                       "Correct the positions, or go on if they are meant to be there.",
                       "halbach-fe solve STUDY -o DIR", False)
     if solution.magnet.is_vacuum and error <= ROUNDING * high:
+        coils = coils_in_words(solution.magnet)
         return Answer(question, said,
-                      "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "
-                      f"there is no iron, so that it is a closed form, without a mesh. {of_blocks}",
+                      f"Yes: {'the part of the blocks' if coils else 'that'} is exact. The study's "
+                      "blocks have a recoil permeability of 1 and there is no iron, so that it is "
+                      f"a closed form, without a mesh.{coils} {of_blocks}",
                       *_after_an_exact_field(solution))
     sigma = _smallest_noise(solution)
     reading = ("a Fourier coefficient of B_r on a circle" if is_fourier(solution.magnet.study)

@@ -34,6 +34,7 @@ from halbach_fe.report.page import (
 from halbach_fe.report.point_maps import geometry_figure
 from halbach_fe.report.words import (
     ROUNDING,
+    coils_in_words,
     decimals,
     flux_density,
     in_a_row,
@@ -98,9 +99,11 @@ def answer(found: Verification) -> Answer:
     measure = ("Measure the magnet, and update its blocks with the map.",
                "halbach-fe infer STUDY --measurements MAP -o DIR")
     if _is_exact(found):
-        return Answer(question, "The computed field is not off at all: no finite elements are "
-                      "needed, it is the exact one of the blocks in vacuum "
-                      f"({flux_density(main, 4)} at most).",
+        coils = coils_in_words(found.magnet)
+        return Answer(question, f"The computed field {'of the blocks ' if coils else ''}is not off "
+                      "at all: no finite elements are needed, it is the exact one of the blocks in "
+                      f"vacuum{' and the coils' if coils else ''} ({flux_density(main, 4)} at "
+                      f"most).{coils}", "Yes, to that error." if coils else
                       "Yes, to the rounding of the computer: it is a closed form.", *measure)
     said = (f"At the study's positions the vector B is off by {flux_density(error)} at most, by "
             f"estimate. That is {relative(found.error_pointwise)} of the largest field there "

@@ -30,12 +30,23 @@ CERTAIN = 100
 PERCENT_FROM = 0.01
 """Part of 1 from which it is told in per cent, not in ppm."""
 
+INTEGRATED = {"racetrack": "1e-3", "round": "1e-6"}
+"""Kinds of coils whose field is no closed form, and how far it was measured to be off beside their
+windings, of its largest value."""
+
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 TO_ONE = "\u00a0:\u00a01"
 
 BAYES_FACTOR_IN_WORDS = ("The Bayes factor of an effect says how many times as probable the "
                          "readings are with it as without it.")
+
+
+def coils_in_words(magnet: Magnet) -> str:
+    """Say how far the field of coils is off; nothing where it is a closed form."""
+    kinds = {coil.kind for coil in magnet.external.coils}
+    return next((f" That of the coils is integrated, and up to {off} of its largest value off."
+                 for kind, off in INTEGRATED.items() if kind in kinds), "")
 
 
 def flux_density(value: float, digits: int = 3, zeros: bool = False) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import tomllib
 from functools import partial
@@ -308,6 +309,11 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
     result = hf.infer(magnet, points, readings, sigma_T=2e-5)
     of_a_map = hf.infer(magnet, hf.field_map(points, readings, sigma_T=2e-5))
     assert np.array_equal(result.posterior.mean, of_a_map.posterior.mean)
+    kept = pickle.loads(pickle.dumps(result))  # as processes that share work do
+    assert np.array_equal(kept.posterior.covariance, result.posterior.covariance)
+    rows = np.arange(5)
+    assert np.array_equal(kept.prediction_posterior.root(rows),
+                          result.prediction_posterior.root(rows))
     two = {"components": ["x", "y"], "sigma_T": 2e-5}
     of_two = hf.infer(magnet, points, readings[:, :2], **two)
     assert np.array_equal(of_two.posterior.mean, hf.infer(magnet, hf.field_map(

@@ -30,6 +30,14 @@ def written(tmp_path, *rows, header=HEADER):
     return path
 
 
+def test_lists_are_taken():
+    table = BlockTable(serial=["a", "b"], type=["", ""], ring=[1, 1], slot=[1, 2],
+                       moment=[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], sigma=[1e-4, 1e-4],
+                       volume=[1e-6, 1e-6], temperature=[20.0, 20.0])
+    assert table.places == [(1, 1), (1, 2)]
+    assert table.moment.shape == (2, 3)
+
+
 def test_round_trip(tmp_path):
     """Every bit, empty cells and a serial with a comma included; nothing else is left."""
     path = tmp_path / "blocks.csv"

@@ -188,6 +188,20 @@ def test_a_field_beside_iron_is_never_called_a_closed_form(given):
     assert verification_page.difference_table(replace(found, magnet=beside))
 
 
+def test_the_integrated_field_of_coils_is_never_called_exact(given):
+    """A racetrack's is 1e-3 off beside it; wire along straight segments has a closed form."""
+    racetrack = {"kind": "racetrack", "size_m": [0.4, 0.2], "corner_radius_m": 0.05,
+                 "current_A": 100.0, "section_m": [0.01, 0.01], "centre_m": [0.0, 0.0, 2.0]}
+    polygon = {"kind": "polygon", "points_m": [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]],
+               "current_A": 100.0, "centre_m": [0.0, 0.0, 2.0]}
+    for found, answer in ((hf.solve(given.magnet, given.session), solution_page.answer),
+                          (hf.verify(given.magnet, given.session), verification_page.answer)):
+        for coil, said in ((racetrack, True), (polygon, False)):
+            shown = answer(replace(found, magnet=given.magnet.with_(external__coils=[coil])))
+            assert ("integrated, and up to 1e-3" in shown.said + shown.trust) == said
+            assert ("that is exact" in shown.trust or "rounding" in shown.trust) != said
+
+
 def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
     """A Fourier coefficient is off by less than B at a point: each answer says what is meant."""
     for quantity, settings in (("flux_density", {}), (
