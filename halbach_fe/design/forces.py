@@ -421,13 +421,12 @@ class Charges:
             for factor, part in block.parts:
                 points, vectors = (np.vstack(each) for each in zip(
                     *_faces(part, order, size), strict=True))
-                areas = np.linalg.norm(vectors, axis=1)
-                normals = vectors / areas[:, None] @ block.axes.T
-                charge = factor / MU_0 * areas * (normals @ polarization)
+                areas, vectors = np.linalg.norm(vectors, axis=1), vectors @ block.axes.T
+                charge = factor / MU_0 * (vectors @ polarization)
                 kept = np.abs(charge) > rounding * areas * abs(block.remanence) / MU_0
-                points = block.from_frame(points) - inwards * size * normals
-                parts.append((points[kept], normals[kept], charge[kept],
-                              np.full(int(kept.sum()), number)))
+                normals = vectors[kept] / areas[kept, None]  # points of corners have no area
+                points = block.from_frame(points[kept]) - inwards * size * normals
+                parts.append((points, normals, charge[kept], np.full(len(points), number)))
         points, normals, charge, owner = (np.concatenate(each)
                                           for each in zip(*parts, strict=True))
         return cls(points, normals, charge, owner)

@@ -266,8 +266,8 @@ def row_order_note(study: Study) -> str:
         ("a drift (drift_T)", any(any(one.drift_T) for one in instruments)),
         ("a drift of the gain (gain_drift)", any(one.gain_drift for one in instruments))) if there]
     return (f"The study has {in_a_row(named)}. It counts on rows in the order in which they "
-            "were read, unless a column time_s says when: without one, a table that was sorted or "
-            "joined makes it wrong." if named else "")
+            "were read, unless a column time_s says when: if there is none, or its times are all "
+            "the same, a table that was sorted or joined makes it wrong." if named else "")
 
 
 def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:

@@ -117,6 +117,17 @@ def test_cubes_that_touch(tmp_path):
     assert found_of(pressed, tmp_path).in_place.force_N[1, 2] == pytest.approx(total, rel=2e-3)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_corners_without_area_have_no_normal():
+    """Of a prism with a re-entrant corner, beside a cuboid: pieces end in points."""
+    corner = [[-0.02, -0.02], [0.02, -0.02], [0.02, 0], [0, 0], [0, 0.02], [-0.02, 0.02]]
+    magnet = hf.magnet_of_blocks({
+        "shape": ["prism", "cuboid"], "outline_m": [corner, None], "x_m": [0, 0.06],
+        "y_m": [0, 0], "z_m": [0, 0], "size_x_m": [None, 0.02], "size_y_m": [None, 0.02],
+        "size_z_m": [0.015, 0.02], "remanence_T": [1.2, 1.1]})
+    assert np.isfinite(Charges.of(magnet.blocks, 4).normals).all()
+
+
 def test_a_cylinder_on_a_wider_one():
     """Coaxial, of radii a and b, they feel sums of ``pi a b J^2 / mu_0 int J_1(ka) J_1(kb) e^-kd
     dk / k`` over the distances d of their ends: 48.96 N. The rim of the narrow one lies on the face
