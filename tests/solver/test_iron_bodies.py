@@ -691,13 +691,13 @@ def test_iron_that_does_not_answer_to_external_fields_is_told(iron, answers):
 
 def test_too_little_memory_is_told_before_meshing(session, monkeypatch):
     """A cube of 4 mm beside a sphere of 40 mm, whose elements are the cube's: 22 GiB by the
-    estimate, which may be a third low, and 28 by the mesh, after 138 s. What is advised is followed
-    until it is enough. Control: with enough memory it is meshed.
+    estimate, and 28 by the mesh, after 138 s. What is advised is followed until it is enough.
+    Control: with enough memory it is meshed.
     """
     magnet = build_magnet(study_with(SPHERE, mesh={"block_size_m": 0.0005}))
     meshed = []
     monkeypatch.setattr(iron_bodies, "assemble_bodies", lambda *of: meshed.append(of) or 1 / 0)
-    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 22.0)
+    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 20.0)
     with pytest.raises(StudyError, match=r"`mesh.block_size_m` .* GiB\. Set mesh") as told:
         solve_bodies(magnet, np.zeros_like, session)
     assert not meshed
