@@ -414,7 +414,7 @@ def test_the_bar_of_a_winding_close_beside_iron(gap, section, known):
             radius = 0.05 + x * section[0] / 2
             turn = radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
             current = 1e4 * of_x * of_z / 4 * angle[0] * np.cross([0.0, 0.0, 1.0], turn)
-            right += force([*turn, 0.0, 0.0, z * section[1] / 2], current)
+            right += force(turn + np.array([0.0, 0.0, z * section[1] / 2]), current)
     fine, coarse = (force(*each) for each in forces_room._coil_elements(
         magnet, SimpleNamespace(nodes=lambda _: place[None])))
     off, bar = np.linalg.norm(fine - right), np.linalg.norm(fine - coarse)

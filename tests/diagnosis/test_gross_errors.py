@@ -356,7 +356,8 @@ def test_a_stated_unit_that_is_wrong_is_no_gross_error_of_the_map(unit_m):
     points = points.reshape(-1, 3)
     noise = 1e-4 * np.random.default_rng(1).standard_normal(points.shape) * [1, 1, 0]
     data = hf.field_map(points, ring.field_T(points) + noise, sigma_T=1e-4)
-    found = answer(hf.diagnose(ring.with_(instrument={"length_unit_m": unit_m}), data))
+    found = answer(hf.diagnose(ring.with_(
+        instrument={"length_unit_m": unit_m}, noise__position_sd_m=1e-5), data))
     assert found.sound == (unit_m == 1)
     assert ("a wrong unit has made too small" in found.trust) != found.sound
     assert found.step.startswith("Look at the unit") != found.sound
