@@ -406,15 +406,18 @@ def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
 def _contradictions(chapters: Sequence[Chapter]) -> list[str]:
     """Name updates whose fields at one place differ by more than their error bars allow.
 
-    One that is sound stands for those that are not, if it read their data.
+    One that is sound stands for those that are not, if it read their data, and one of what a
+    diagnosis has found for those before it.
     """
     allowed = 5.0  # standard deviations of the difference, as if the updates shared nothing
     found = []
     for (one, mine), (other, its) in combinations([
             (each, each.field) for each in chapters if each.field is not None], 2):
         apart = abs(mine.mean_T - its.mean_T)
-        is_settled = any(good.sound and not bad.sound and good.reads_data_of(bad)
-                         for good, bad in ((one, other), (other, one)))
+        is_settled = any(
+            good.sound and good.reads_data_of(bad) and (
+                not bad.sound or any(map(good.has_study_of, chapters)))
+            for good, bad in ((one, other), (other, one)))
         if (mine.at_m, mine.along) == (its.at_m, its.along) and not is_settled and (
                 apart > allowed * math.hypot(mine.sd_T, its.sd_T)):
             place = ", ".join(f"{round(1e3 * value, 6) + 0.0:.6g}" for value in mine.at_m)

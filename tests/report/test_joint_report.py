@@ -566,14 +566,18 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
         "other,")
 
 
-def updates_of_two_maps(home, first_T, second_T, sound):
-    """An update by one map, as sound as the other that read two."""
+def updates_of_two_maps(home, first_T, second_T, sound, study="study.toml"):
+    """An update by two maps, sound or not, and one by the first of them, which is sound.
+
+    ``study`` is that of the first.
+    """
     (home / "second.csv").write_text("second")
     poor = Answer("Like what?", "Much.", "Only in part.", "Look.", "", sound)
     for name, field_T, maps, answer in (("both", first_T, ["map.csv", "second.csv"], poor),
                                         ("one", second_T, ["map.csv"], None)):
         with result_folder(home / name, "halbach-fe infer", "tiny",
-                           [home / "study.toml", *(home / one for one in maps)]):
+                           [home / (study if name == "both" else "study.toml"),
+                            *(home / one for one in maps)]):
             write_text(home / name / "summary.json", json.dumps({"strongest_field": {
                 "at_m": [0.01, 0, 0], "along": [1, 0, 0], "mean_T": field_T, "sd_T": 2e-5}}))
             write_any_page(home / name / "page.html", [], STUDY, answer=answer or Answer(
@@ -595,6 +599,16 @@ def test_a_sound_update_by_less_data_takes_no_place(home):
 
 def test_updates_that_agree_within_their_bars_fit(home):
     assert updates_of_two_maps(home, 0.353590, 0.353600, sound=True).answer.sound
+
+
+def test_an_update_of_what_was_found_stands_for_the_one_before(home):
+    """Control: one of the same study."""
+    results(home / "diagnosis", "diagnose", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.diagnosed.toml"])
+    updates_of_two_maps(home, 0.353590, 0.357113, True, "diagnosis/study.diagnosed.toml")
+    assert found_in(home, "diagnosis", "both", "one").doubts == []
+    updates_of_two_maps(home, 0.353590, 0.357113, True)
+    assert any("contradict" in said for said in found_in(home, "diagnosis", "both", "one").doubts)
 
 
 def test_the_instrument_that_an_update_found_makes_no_other_version(home):
