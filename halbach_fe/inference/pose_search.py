@@ -3,8 +3,8 @@
 A pose is where the middle of the map lies, in m, and a rotation vector, which turns it about that
 middle from the axes of the map to those of the magnet.
 
-The field is that of the nominal blocks in vacuum and of the study's external sources, such as
-neighbouring magnets: their places are those beside this magnet, in whatever pose the map is.
+The field is that of the nominal blocks and of neighbouring magnets, in vacuum: their places are
+those beside this magnet, in whatever pose the map is.
 
 For a line of readings along the magnet, the field is computed once along many lines parallel to the
 magnet's axis. The readings are compared with all of them, in both directions and at all shifts
@@ -30,9 +30,8 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import UNDIRECTED_COLUMN
 from halbach_fe.measurement.map_check import WORTH_TRYING
 from halbach_fe.measurement.probe_law import DIFFERENCE_M
-from halbach_fe.solver.exact_block_field import external_field
+from halbach_fe.solver.exact_block_field import neighbour_field
 from halbach_fe.solver.separate_blocks import field_in_vacuum
-from halbach_fe.study.external_keys import External
 
 SAME_M, SAME_RAD = 1e-3, 0.02
 """Candidates that differ by less are one: in m, and in rad."""
@@ -165,8 +164,9 @@ def coarse_poses(
     line = line_of(points[rows], NARROW * magnet.bore_radius)
     pace = pace or Pace(lambda _: None)
     own = field_in_vacuum(magnet.blocks)
-    vacuum = Shown(own if magnet.external == External() else (
-        lambda places: own(places) + external_field(magnet, places)), total)
+    # of other sources trial poses may put points into windings, where there is no field to compare
+    vacuum = Shown(lambda places: own(places) + sum(
+        neighbour_field(magnet, one, places) for one in magnet.external.neighbours), total)
     improved = _searched(magnet, vacuum, points, used, training, pace, line, across_m)
     best = improved[0][0]
     size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))

@@ -5,8 +5,9 @@ of the probe point elsewhere again. Two steps find the rotation and the translat
 map's coordinates to those of the magnet.
 
 1. Every rotation by right angles is combined with translations along the magnet's axis. The nominal
-   blocks in vacuum and external sources, multiplied by any factor, are compared with the map; the
-   best candidates are improved by least squares, and those that end in the same place are one.
+   blocks in vacuum and those of neighbouring magnets, multiplied by any factor, are compared with
+   the map; the best candidates are improved by least squares, and those that end in the same place
+   are one.
 2. For each of the best, least squares with the magnet's own model: pose and probe are fitted
    together with the magnetizations of the blocks, whose prior is that of the study. The evidence
    compares the candidates. A symmetric magnet makes some of them equal, and all of these are

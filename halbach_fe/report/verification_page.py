@@ -102,8 +102,8 @@ def answer(found: Verification) -> Answer:
         coils = coils_in_words(found.magnet)
         return Answer(question, f"The computed field {'of the blocks ' if coils else ''}is not off "
                       "at all: no finite elements are needed, it is the exact one of the blocks in "
-                      f"vacuum{' and the coils' if coils else ''} ({flux_density(main, 4)} at "
-                      f"most).{coils}", "Yes, to that error." if coils else
+                      f"vacuum ({flux_density(main, 4)} at most"
+                      f"{', with the coils' if coils else ''}).{coils}", "Yes, to that error." if coils else
                       "Yes, to the rounding of the computer: it is a closed form.", *measure)
     said = (f"At the study's positions the vector B is off by {flux_density(error)} at most, by "
             f"estimate. That is {relative(found.error_pointwise)} of the largest field there "

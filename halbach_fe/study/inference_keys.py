@@ -177,6 +177,7 @@ class Plan(StudyModel):
 RESULTS = ("run.json", "study.registered.toml")
 """Files beside which `halbach-fe register` makes a folder for every map."""
 
+
 class MapSettings(StudyModel):
     """One of several maps of the magnet.
 

@@ -552,6 +552,20 @@ def test_a_probe_that_another_map_has_found_keeps_what_changes_from_map_to_map()
     assert found == ProbePrior(gain=2e-4)  # no term without any freedom
 
 
+def test_trial_poses_may_lie_in_the_winding_of_a_coil(generator, tmp_path):
+    """Around the magnet, where no reading is: the search asked for the field there, and ended."""
+    study = cuboids.STUDY.with_(external={"coils": [
+        {"kind": "round", "radius_m": 0.03, "section_m": [0.05, 0.05], "centre_m": [0, 0, 0.25],
+         "current_A": 10.0}]})
+    own = build_magnet(cuboids.STUDY)
+    nominal = np.array([np.array(one.easy_axis) * one.remanence for one in own.blocks])
+    shown = cuboids.field(cuboids.STUDY, nominal, cuboids.CIRCLES)
+    data = field_map(cuboids.CIRCLES, shown + cuboids.NOISE_T * generator.standard_normal(
+        shown.shape))
+    (found, *_) = register(build_magnet(study), data, Session.open(tmp_path))
+    assert np.isfinite(found.middle_m).all()
+
+
 def test_a_map_beside_neighbouring_magnets_is_found(generator, tmp_path):
     """The search left out what the study says of them, and refused the map. The second neighbour
     is reversed, so that the map lies nowhere else; the blocks are magpylib's.
