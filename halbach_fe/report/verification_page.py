@@ -103,7 +103,8 @@ def answer(found: Verification) -> Answer:
         return Answer(question, f"The computed field {'of the blocks ' if coils else ''}is not off "
                       "at all: no finite elements are needed, it is the exact one of the blocks in "
                       f"vacuum ({flux_density(main, 4)} at most"
-                      f"{', with the coils' if coils else ''}).{coils}", "Yes, to that error." if coils else
+                      f"{', with the coils' if coils else ''}).{coils}",
+                      "Yes, to that error." if coils else
                       "Yes, to the rounding of the computer: it is a closed form.", *measure)
     said = (f"At the study's positions the vector B is off by {flux_density(error)} at most, by "
             f"estimate. That is {relative(found.error_pointwise)} of the largest field there "
