@@ -406,8 +406,8 @@ def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
 def _contradictions(chapters: Sequence[Chapter]) -> list[str]:
     """Name updates whose fields at one place differ by more than their error bars allow.
 
-    One that is sound stands for those that are not, if it read their data, and one of what a
-    diagnosis has found for those before it.
+    A sound one stands for another that read no more data, if that is not sound, or if it is itself
+    of a study that a command has written, such as that of a diagnosis.
     """
     allowed = 5.0  # standard deviations of the difference, as if the updates shared nothing
     found = []

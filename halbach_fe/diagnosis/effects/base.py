@@ -384,7 +384,7 @@ def with_array(study: Study, **keys: Any) -> Study:
     return study.with_(array=study.array.with_(**keys))
 
 
-def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
+def unchecked_blocks(study: Study) -> tuple[MagnetBlock, ...]:
     """Return the blocks of a study; those that overlap are refused where its magnet is built."""
     return blocks_of_array(study.array, study.dimension)
 
@@ -397,7 +397,7 @@ def blocks_at(blocks: Sequence[MagnetBlock], place: Place) -> list[int]:
 
 def each_block(study: Study) -> list[Place]:
     """Return a place for every block that is not missing."""
-    return [place_of(block) for block in blocks_of(study) if block.remanence]
+    return [place_of(block) for block in unchecked_blocks(study) if block.remanence]
 
 
 def place_of(block: MagnetBlock, other: MagnetBlock | None = None) -> Place:
@@ -414,7 +414,7 @@ def can_be_uneven(block: MagnetBlock) -> bool:
 
 def each_ring(study: Study) -> list[Place]:
     """Return a place for every ring; none in two dimensions."""
-    rings = {block.ring for block in blocks_of(study) if block.remanence}
+    rings = {block.ring for block in unchecked_blocks(study) if block.remanence}
     return [] if study.dimension == 2 else [Place(ring) for ring in sorted(rings)]
 
 
@@ -432,7 +432,7 @@ def with_remanence(study: Study) -> Study:
 
 def changed(nominal: NominalFields, study: Study) -> Floats:
     """Return B (n, 3) in T of the nominal blocks of ``study``, less that of ``nominal``."""
-    blocks = blocks_of(study)
+    blocks = unchecked_blocks(study)
     others = np.flatnonzero([new != old for new, old in zip(blocks, nominal.blocks, strict=True)])
     return np.asarray(nominal.fields_of([blocks[number] for number in others]).sum(axis=0)
                       - nominal.block_fields[others].sum(axis=0))

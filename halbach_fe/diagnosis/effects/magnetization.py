@@ -17,12 +17,12 @@ from halbach_fe.diagnosis.effects.base import (
     Parameter,
     Place,
     blocks_at,
-    blocks_of,
     can_be_uneven,
     each_block,
     each_ring,
     place_of,
     together,
+    unchecked_blocks,
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -115,7 +115,7 @@ class MagnetizationGradientEffect(Effect):
     parameters = (Parameter("gradient", "1", 0.02),)
 
     def places(self, study: Study) -> Sequence[Place]:
-        blocks = blocks_of(study)
+        blocks = unchecked_blocks(study)
         uneven = {block.place for block in blocks if can_be_uneven(block)}
         each = [place for place in each_block(study) if (place.ring, place.slot) in uneven]
         return [Place(), *each] if len(uneven) == len(blocks) else each
@@ -133,7 +133,7 @@ def _more_uneven(study: Study, place: Place, change: float, key: str, name: str)
 
     ``key`` is its key in exceptions, ``name`` that of the attribute of blocks.
     """
-    blocks = blocks_of(study)
+    blocks = unchecked_blocks(study)
     present = {number: getattr(blocks[number], name) for number in blocks_at(blocks, place)}
     return with_exceptions(study, [
         BlockException.model_validate(where | {key: value + float(change)})
@@ -151,7 +151,7 @@ class CornersDemagnetizedEffect(Effect):
     parameters = (Parameter("loss", "1", 0.1),)
 
     def places(self, study: Study) -> Sequence[Place]:
-        return [Place()] if all(map(can_be_uneven, blocks_of(study))) else []
+        return [Place()] if all(map(can_be_uneven, unchecked_blocks(study))) else []
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         lost = [replace(block, corner_loss=block.corner_loss + 1) for block in nominal.blocks]
@@ -259,7 +259,7 @@ class BlockPutInWronglyEffect(AssemblyEffect):
 
     def places(self, study: Study) -> Sequence[Place]:
         return list(dict.fromkeys(
-            _place(block, np.array(turn)) for block in blocks_of(study)
+            _place(block, np.array(turn)) for block in unchecked_blocks(study)
             if block.remanence for turn in (*turns_in_slot(block), *turns_over(block))))
 
     def simpler(self, magnet: Magnet) -> Sequence[Sources]:
@@ -310,7 +310,7 @@ class BlocksSwappedEffect(AssemblyEffect):
     def places(self, study: Study) -> Sequence[Place]:
         """Return pairs of successive blocks of a ring, as examples; the search uses `shortlist`."""
         rings: dict[int, list[MagnetBlock]] = {}
-        for block in blocks_of(study):
+        for block in unchecked_blocks(study):
             rings.setdefault(block.ring, []).append(block)
         return [place_of(block, after) for ring in rings.values()
                 for block, after in zip(ring, ring[1:] + ring[:1], strict=True)
@@ -325,7 +325,7 @@ class BlocksSwappedEffect(AssemblyEffect):
         evidence of the exchange is c' score - c' information c / 2. Both terms follow for all pairs
         at once from the entries of the two blocks.
         """
-        blocks, size = blocks_of(study), study.dimension
+        blocks, size = unchecked_blocks(study), study.dimension
         vectors = mean.reshape(len(blocks), size)
         turns = np.array([block.shape_axes[:size, :size] for block in blocks])
         own = np.einsum("jba,jb->ja", turns, vectors)

@@ -13,8 +13,8 @@ from halbach_fe.diagnosis.effects.base import (
     MagnetizationEffect,
     Parameter,
     Place,
-    blocks_of,
     together,
+    unchecked_blocks,
     with_array,
     with_exceptions,
     with_remanence,
@@ -87,7 +87,7 @@ def _with_permeabilities(
                                     for one in array.exceptions):
         return with_array(with_remanence(study), **keys(
             array.recoil_permeability, array.recoil_permeability_across))
-    blocks, is_stated = blocks_of(study), any(
+    blocks, is_stated = unchecked_blocks(study), any(
         one.recoil_permeability_across for one in array.exceptions)
     present = {number: (block.recoil_permeability, block.recoil_permeability_across
                         if is_stated or not block.isotropic else None)
@@ -184,7 +184,7 @@ class KneeEffect(Effect):
         material = study.demagnetization
         if study.dimension == 2 or (material is not None and material.irreversible):
             return []
-        blocks = blocks_of(study)
+        blocks = unchecked_blocks(study)
         strongest = max((abs(block.remanence) for block in blocks), default=0.0)
         # largest number of blocks for which losses are searched unless the study describes the
         # material: each place takes a solution of the whole magnet, of a few seconds for 64 blocks
@@ -284,7 +284,7 @@ def _mean_losses(study: Study, materials: Sequence[Demagnetization | None]) -> F
     """Return the change of the mean polarization of every block (materials, 3 blocks) in T, if each
     is in the field of the intact blocks in vacuum.
     """
-    blocks = blocks_of(study)
+    blocks = unchecked_blocks(study)
     # Gauss nodes per direction and block at which the field is computed for the cheap estimate
     nodes = 3
     cells = cells_of(blocks, 1, divisions=nodes)

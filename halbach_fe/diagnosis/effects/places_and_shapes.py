@@ -21,11 +21,11 @@ from halbach_fe.diagnosis.effects.base import (
     Parameter,
     Place,
     blocks_at,
-    blocks_of,
     changed,
     each_block,
     each_ring,
     together,
+    unchecked_blocks,
     with_array,
     with_exceptions,
     with_remanence,
@@ -154,7 +154,7 @@ def _oval(angle_deg: float) -> tuple[float, float]:
 
 def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of the blocks of oval rings, by slots if the rings are equal."""
-    blocks = blocks_of(study)
+    blocks = unchecked_blocks(study)
     return [BlockException(**where, displacement_m=(float(np.dot(values, _oval(angle))), 0.0, 0.0))
             for where, angle in together(blocks, {
                 number: block.angle_deg for number, block in enumerate(blocks)})]
@@ -249,7 +249,7 @@ def _planes(study: Study) -> list[Place]:
     """
     if study.dimension == 2:
         return []
-    blocks = [block for block in blocks_of(study) if block.remanence]
+    blocks = [block for block in unchecked_blocks(study) if block.remanence]
     middles = np.array([block.middle[:2] for block in blocks])
     counts = Counter(block.ring for block in blocks)
     # distance from the plane of a block beside it, at least: half of that of a regular ring
@@ -283,7 +283,7 @@ def _half(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
 
 def _halves_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of both halves, by slots if these are the same in all rings."""
-    shift, blocks = np.array(values) @ _in_plane(place.at_m[0]), blocks_of(study)
+    shift, blocks = np.array(values) @ _in_plane(place.at_m[0]), unchecked_blocks(study)
     sides = {number: _side(block.middle, place) for number, block in enumerate(blocks)}
     return [BlockException(**where, shift_m=tuple((side * shift).tolist()))
             for where, side in together(blocks, sides)]
