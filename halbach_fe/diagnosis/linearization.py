@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -65,9 +65,11 @@ class NominalSolver:
         """
         return self.field(with_rough_mesh(study), points)
 
-    def iron_change(self, study: Study, points: Floats) -> Floats | None:
+    def iron_change(self, study: Study, points: Floats, few_modes: bool) -> Floats | None:
         """Return `iron_change` of the magnet of a study at points (n, 3) in m."""
-        found: Floats | None = self._once("iron", iron_change, study, points)
+        found: Floats | None = self._once(
+            "iron of few modes" if few_modes else "iron",
+            partial(iron_change, few_modes=few_modes), study, points)
         return found
 
     def _once(

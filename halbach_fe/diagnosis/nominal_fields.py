@@ -51,9 +51,11 @@ class NominalFields:
     solve: Callable[[Study], Floats]
     """Function of a study that returns the field (n, 3) in T of its nominal magnet at the points,
     by finite elements."""
-    solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
+    solve_iron: Callable[[Study, bool], Floats | None] = field(
+        default=lambda study, few_modes: None, kw_only=True)
     """Function of a study that returns the change (n, 3) in T that its iron makes to the field of
-    blocks in vacuum, or None if `solve` takes no longer."""
+    blocks in vacuum, or None if `solve` takes no longer; and of whether few modes suffice, see
+    `halbach_fe.solver.routes.iron_change`."""
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
     """Magnetizations that are expected from measurements of the single blocks, in D dimensions;
     None to use the nominal ones. Shape (blocks, D), in A/m."""
@@ -130,9 +132,9 @@ class NominalFields:
         """B of the nominal magnet by finite elements, (n, 3) in T."""
         return self.solve(self.study)
 
-    def change_by_iron(self, study: Study) -> Floats:
+    def change_by_iron(self, study: Study, few_modes: bool = False) -> Floats:
         """Return the change (n, 3) in T of B that the iron of another study makes to this one."""
-        quick = self.solve_iron(study)
+        quick = self.solve_iron(study, few_modes)
         return self.solve(study) - self.finite_element_field if quick is None else quick
 
     @cached_property

@@ -182,7 +182,7 @@ class Campaign:
 
     def scene(
         self, study: Study, field: FieldAt | None = None,
-        iron: Callable[[Study, Floats], Floats | None] | None = None,
+        iron: Callable[[Study, Floats, bool], Floats | None] | None = None,
         magnetizations: Floats | None = None,
     ) -> Scene:
         """Return the nominal magnet of a study at the points of all maps.
@@ -205,9 +205,9 @@ class Campaign:
                 return field(changed, points)[rows]
             return at_rows
 
-        def solve_iron(rows: slice) -> Callable[[Study], Floats | None]:
-            def at_rows(changed: Study) -> Floats | None:
-                found = None if iron is None else iron(changed, points)
+        def solve_iron(rows: slice) -> Callable[[Study, bool], Floats | None]:
+            def at_rows(changed: Study, few_modes: bool) -> Floats | None:
+                found = None if iron is None else iron(changed, points, few_modes)
                 return None if found is None else found[rows]
             return at_rows
 

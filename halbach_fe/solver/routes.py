@@ -234,15 +234,18 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
     return field
 
 
-def iron_change(magnet: Magnet, points: Floats, session: Session) -> Floats | None:
+def iron_change(
+    magnet: Magnet, points: Floats, session: Session, few_modes: bool = False
+) -> Floats | None:
     """Return the change (n, 3) in T that the iron makes to B of blocks in vacuum.
 
-    The result is None for routes on which the whole magnet is solved in the same time.
+    The result is None for routes on which the whole magnet is solved in the same time. For
+    ``few_modes`` see `iron_alone`.
     """
     points = check_points(magnet, points)
     if choose_route(magnet, points) is not Route.MOMENTS or not magnet.iron:
         return None
-    return iron_alone(magnet, points, session)
+    return iron_alone(magnet, points, session, few_modes)
 
 
 def vacuum_part(magnet: Magnet, points: Floats) -> Floats:

@@ -23,7 +23,7 @@ from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.progress import Progress
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.solver.axisymmetric_iron import IronReaction, solve_iron
+from halbach_fe.solver.axisymmetric_iron import IronReaction, highest_mode_at, solve_iron
 from halbach_fe.solver.exact_block_field import FieldOfBlocks, external_field, unit_fields
 from halbach_fe.solver.iron_bodies import COARSER, BodiesReaction, key_of, size_of, solve_bodies
 from halbach_fe.solver.iron_modes import Asked, Resolution, check_bodies
@@ -198,14 +198,15 @@ def external_on_losses(magnet: Magnet) -> float:
 
 def _solve_iron(
     magnet: Magnet, source: Field, session: Session, estimate: bool = False, rough: bool = False,
-    start: Any = None,
+    start: Any = None, modes: int | None = None
 ) -> IronReaction | BodiesReaction:
     """Solve for the reaction of a magnet's iron, on a coarse mesh if ``rough``.
 
-    ``start`` is a solution of the same iron on the same mesh with a similar source.
+    ``start`` is a solution of the same iron on the same mesh with a similar source. A rough one of
+    coaxial iron has azimuthal modes up to ``modes``, by default all that the source needs.
     """
     if magnet.iron_is_axisymmetric:
-        resolution = replace(Resolution().coarser(1), modes=None) if rough else None
+        resolution = replace(Resolution().coarser(1), modes=modes) if rough else None
         return solve_iron(magnet.iron, source, session, magnet.name, resolution,
                           estimate, start)
     return solve_bodies(magnet, source, session, estimate, start, COARSER if rough else 1.0)
@@ -237,14 +238,21 @@ def sizes_in_iron(magnet: Magnet) -> list[float]:
     return [sizes.of_body(body) for body in magnet.iron]
 
 
-def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
+def iron_alone(
+    magnet: Magnet, points: Floats, session: Session, few_modes: bool = False
+) -> Floats:
     """Return the reaction (n, 3) in T of the iron to the blocks in vacuum, at points (n, 3) in m.
 
     That is a few per cent off the change of field that the iron makes if the blocks are permeable,
     in a small part of the time. The coarse mesh adds 1e-3 of that change, in half the time.
+    ``few_modes`` keeps the azimuthal modes that reach the points, where saturation couples more of
+    them: in a third of the time, a tube of 2 mm that 1 T saturates was 0.12 off in shape and 0.11
+    in amplitude, one of 10 mm 3e-4.
     """
+    few = highest_mode_at(magnet.iron, points) if (
+        few_modes and magnet.iron_is_axisymmetric) else None
     return _solve_iron(magnet, field_in_vacuum(present_blocks(magnet.blocks)), session,
-                       rough=True).field(points)
+                       rough=True, modes=few).field(points)
 
 
 def separate_columns(

@@ -62,3 +62,25 @@ def test_iron_alone_is_nearly_the_change_by_iron(short_dipole, session):
             change -= solve_separate(magnet_with(permeability), session, False).field(points)
         error = np.abs(iron_alone(around, points, session) - change).max() / np.abs(change).max()
         assert least <= error <= most
+
+
+def test_few_modes_resemble_all_of_iron_that_saturates(short_dipole, session):
+    """A tube of 2 mm, whose saturation couples modes that the bore does not see to those it does.
+
+    A map of the bore sees modes up to 16, and one outside all of them.
+    """
+    around = build_magnet(short_dipole(
+        array__outer_radius_m=0.14, array__rings=1, array__blocks_per_ring=8,
+        array__block={"shape": "cuboid", "width_m": 0.05},
+        iron_ring={"inner_radius_m": 0.15, "outer_radius_m": 0.152, "curve": {
+            "kind": "froehlich_kennelly", "initial_relative_permeability": 1000.0,
+            "saturation_polarization_T": 2.0}}))
+
+    def resemblance(points):
+        few, every = (iron_alone(around, points, session, few_modes=some) for some in (True, False))
+        return np.sum(few * every) / np.sqrt(np.sum(few**2) * np.sum(every**2))
+
+    bore, outside = (np.vstack([circle(radius, 6, z) for z in (-0.1, 0.0, 0.06)])
+                     for radius in (0.05, 0.17))
+    assert 0.95 < resemblance(bore) < 1 - 1e-9
+    assert abs(resemblance(outside) - 1) < 1e-12

@@ -256,7 +256,8 @@ class IronRingEffect(Effect):
         return places[:2]
 
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats:
-        return nominal.change_by_iron(self.apply(nominal.study, place, [1.0]))[None]
+        return nominal.change_by_iron(
+            self.apply(nominal.study, place, [1.0]), few_modes=True)[None]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`, followed by those of the refinements.
@@ -264,7 +265,8 @@ class IronRingEffect(Effect):
         Rings of all places explain some of what another one does. Without their refinements a thick
         one was taken for a thin one that saturates, and stayed where the fit is best nearby.
         """
-        return np.concatenate([self.rough_signature(nominal, place),
+        change = nominal.change_by_iron(self.apply(nominal.study, place, [1.0]))
+        return np.concatenate([change[None],
                                self.refine(nominal, place, [1.0, *np.zeros(4).tolist()])])
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
